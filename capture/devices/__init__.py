@@ -1,0 +1,1 @@
+"""Devices that hold a sensor: the simulated array here; real ones beside it."""

@@ -1,0 +1,108 @@
+"""Products of stages: written under a temporary name and renamed, with a record of how they were made."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+_CHUNK = 1 << 20
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Give a temporary path beside `path`; rename it on success, remove it on any failure.
+
+    The temporary name keeps the suffix of `path`, so that writers which choose a format by suffix
+    work. It may be filled with a file or with a folder. Nothing half-written is ever left, Ctrl-C
+    included; a product that stood at `path` stays until the new one is whole.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".partial-{os.getpid()}-{path.name}")
+    _remove(partial)
+    try:
+        yield partial
+        if partial.is_dir() and path.exists():
+            old = path.with_name(f".old-{os.getpid()}-{path.name}")
+            os.replace(path, old)
+            os.replace(partial, path)
+            _remove(old)
+        else:
+            os.replace(partial, path)
+    except BaseException:
+        _remove(partial)
+        raise
+
+
+def hash_file(path: Path) -> str:
+    """SHA-256 of a file's bytes, as hex."""
+    digest = hashlib.sha256()
+    with Path(path).open("rb") as handle:
+        while block := handle.read(_CHUNK):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+def stage_record(stage: str, settings: Any, inputs: Mapping[str, str]) -> dict[str, Any]:
+    """What makes a product what it is: stage, code version, resolved settings, input hashes.
+
+    Args:
+        stage: the stage's name.
+        settings: a dataclass, or None.
+        inputs: by name, the hash of each input.
+    """
+    resolved = dataclasses.asdict(settings) if dataclasses.is_dataclass(settings) else None
+    record = {
+        "stage": stage,
+        "code": code_version(),
+        "settings": resolved,
+        "inputs": dict(sorted(inputs.items())),
+    }
+    whole: dict[str, Any] = json.loads(json.dumps(record, default=str))
+    return whole
+
+
+def code_version() -> str:
+    """The installed version of likeness."""
+    try:
+        return metadata.version("likeness")
+    except metadata.PackageNotFoundError:
+        return "uninstalled"
+
+
+def is_current(product: Path, record: Mapping[str, Any]) -> bool:
+    """Whether `product` exists and was made exactly as `record` says."""
+    beside = record_path(product)
+    if not Path(product).exists() or not beside.exists():
+        return False
+    try:
+        found = json.loads(beside.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError):
+        return False
+    return bool(found == record)
+
+
+def write_record(product: Path, record: Mapping[str, Any]) -> None:
+    """Write the record beside its product."""
+    with replacing(record_path(product)) as partial:
+        partial.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+
+
+def record_path(product: Path) -> Path:
+    """Where the record of a product stands: `frame_0000.ply` -> `frame_0000.ply.record.json`."""
+    return Path(product).with_name(Path(product).name + ".record.json")
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)

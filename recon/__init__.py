@@ -1,0 +1,1 @@
+"""Reconstruction: one instant in space. Calibration, rectified stereo, fusion, scan meshes."""

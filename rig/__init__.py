@@ -1,0 +1,1 @@
+"""The face rig: template transfer, weights, blendshape update, export."""

@@ -1,0 +1,1 @@
+"""The simulated actor: a procedural head, its shapes, its skin, and a renderer."""

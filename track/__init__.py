@@ -1,0 +1,1 @@
+"""Tracking: the same face through time. Rasterizer, flow, lifting, registration."""

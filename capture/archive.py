@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zipfile
+import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -41,17 +42,19 @@ def read_archive(
         missing = [key for key in required if key not in archive.files]
         if missing:
             raise ShapeError(
-                f"{path}: missing {', '.join(missing)}; it holds {', '.join(archive.files) or 'nothing'}"
+                f"{path}: missing {', '.join(missing)}; "
+                f"it holds {', '.join(archive.files) or 'nothing'}"
             )
         out: dict[str, NDArray[Any]] = {}
         for key in [*required, *(key for key in optional if key in archive.files)]:
             try:
                 out[key] = archive[key]
-            except (ValueError, OSError, EOFError, zipfile.BadZipFile, zipfile.zlib.error) as error:  # type: ignore[attr-defined]
+            except (ValueError, OSError, EOFError, zipfile.BadZipFile, zlib.error) as error:
                 raise ShapeError(f"{path}: {key} cannot be read: {error}") from error
     for key, array in out.items():
         if array.dtype.kind == "f" and not np.isfinite(array).all():
-            raise ShapeError(f"{path}: {key} holds {int((~np.isfinite(array)).sum())} numbers that are not finite")
+            bad = int((~np.isfinite(array)).sum())
+            raise ShapeError(f"{path}: {key} holds {bad} numbers that are not finite")
     return out
 
 

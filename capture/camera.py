@@ -52,9 +52,13 @@ class Camera:
         if not np.isfinite(numbers).all():
             raise CameraError(f"{self.name}: expected finite intrinsics, found {numbers.tolist()}")
         if self.fx <= 0 or self.fy <= 0:
-            raise CameraError(f"{self.name}: focal lengths must be above 0 px, found {self.fx}, {self.fy}")
+            raise CameraError(
+                f"{self.name}: focal lengths must be above 0 px, found {self.fx}, {self.fy}"
+            )
         if self.width < 1 or self.height < 1:
-            raise CameraError(f"{self.name}: size must be at least 1 x 1 px, found {self.width} x {self.height}")
+            raise CameraError(
+                f"{self.name}: size must be at least 1 x 1 px, found {self.width} x {self.height}"
+            )
         distortion.flags.writeable = False
         object.__setattr__(self, "distortion", distortion)
 
@@ -158,13 +162,16 @@ class Camera:
             slope = self.distort_jacobian(flat)
             determinant = slope[:, 0, 0] * slope[:, 1, 1] - slope[:, 0, 1] * slope[:, 1, 0]
             determinant = np.where(np.abs(determinant) < 1e-3, 1e-3, determinant)
-            step = np.stack(
-                [
-                    slope[:, 1, 1] * miss[:, 0] - slope[:, 0, 1] * miss[:, 1],
-                    slope[:, 0, 0] * miss[:, 1] - slope[:, 1, 0] * miss[:, 0],
-                ],
-                axis=1,
-            ) / determinant[:, None]
+            step = (
+                np.stack(
+                    [
+                        slope[:, 1, 1] * miss[:, 0] - slope[:, 0, 1] * miss[:, 1],
+                        slope[:, 0, 0] * miss[:, 1] - slope[:, 1, 0] * miss[:, 0],
+                    ],
+                    axis=1,
+                )
+                / determinant[:, None]
+            )
             length = np.linalg.norm(step, axis=1, keepdims=True)
             flat = flat - step * np.minimum(1.0, 0.5 / np.maximum(length, 1e-300))
         lost = ~(np.abs(self.distort(flat) - target).max(axis=1) < 1e-10)

@@ -2,7 +2,8 @@
 
 ::
 
-    {"units": "mm", "cameras": [{"name", "width", "height", "K": 3x3, "dist": [k1,k2,p1,p2,k3], "R": 3x3, "t": 3}]}
+    {"units": "mm", "cameras": [{"name", "width", "height", "K": 3x3,
+                                 "dist": [k1,k2,p1,p2,k3], "R": 3x3, "t": 3}]}
 
 with x_cam = R x_world + t, OpenCV axes, pixel centres at integers.
 """
@@ -53,11 +54,13 @@ def cameras_from_document(document: Any, where: str) -> CameraArray:
         CameraError: listing every key, size or value that does not fit.
     """
     if not isinstance(document, Mapping):
-        raise CameraError(f"{where}: expected an object with 'cameras', found {type(document).__name__}")
+        raise CameraError(
+            f"{where}: expected an object with 'cameras', found {type(document).__name__}"
+        )
     problems = _key_problems(document, ("units", "cameras"), _TOP, "top level")
     raise_all(where, problems, CameraError)
     if document["units"] != "mm":
-        raise CameraError(f"{where}: units must be \"mm\", found {document['units']!r}")
+        raise CameraError(f'{where}: units must be "mm", found {document["units"]!r}')
     entries = document["cameras"]
     if not isinstance(entries, list) or not entries:
         raise CameraError(f"{where}: 'cameras' must be a list of at least one camera")
@@ -74,7 +77,9 @@ def cameras_from_document(document: Any, where: str) -> CameraArray:
         raise CameraError(f"{where}: {error}") from error
 
 
-def write_cameras(path: Path, cameras: CameraArray, report: Mapping[str, Any] | None = None) -> None:
+def write_cameras(
+    path: Path, cameras: CameraArray, report: Mapping[str, Any] | None = None
+) -> None:
     """Write cameras.json, whole or not at all.
 
     Args:
@@ -112,7 +117,8 @@ def _camera(entry: Any, index: int) -> Camera:
     raise_all(label, _key_problems(entry, _REQUIRED, _REQUIRED + _OPTIONAL, "camera"), CameraError)
     if not isinstance(entry["name"], str) or not _plain(entry["name"]):
         raise CameraError(
-            f"camera {index}: name must be letters, digits, '-', '_' or '.', found {entry['name']!r}"
+            f"camera {index}: name must be letters, digits, '-', '_' or '.', "
+            f"found {entry['name']!r}"
         )
     k = _numbers(entry, "K", (3, 3), label)
     if k[0, 1] != 0 or k[1, 0] != 0 or not np.array_equal(k[2], [0, 0, 1]):

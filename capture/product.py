@@ -1,4 +1,4 @@
-"""Products of stages: written under a temporary name and renamed, with a record of how they were made."""
+"""Products of stages: written under a temporary name, renamed, with a record of their making."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ def replacing(path: Path) -> Iterator[Path]:
         yield partial
         if partial.is_dir() and path.exists():
             old = path.with_name(f".old-{os.getpid()}-{path.name}")
-            os.replace(path, old)
-            os.replace(partial, path)
+            path.replace(old)
+            partial.replace(path)
             _remove(old)
         else:
-            os.replace(partial, path)
+            partial.replace(path)
     except BaseException:
         _remove(partial)
         raise
@@ -59,7 +59,8 @@ def stage_record(stage: str, settings: Any, inputs: Mapping[str, str]) -> dict[s
         settings: a dataclass, or None.
         inputs: by name, the hash of each input.
     """
-    resolved = dataclasses.asdict(settings) if dataclasses.is_dataclass(settings) else None
+    plain = dataclasses.is_dataclass(settings) and not isinstance(settings, type)
+    resolved = dataclasses.asdict(settings) if plain else None
     record = {
         "stage": stage,
         "code": code_version(),

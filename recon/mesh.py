@@ -105,9 +105,13 @@ def read_obj(path: Path) -> Mesh:
                 faces.append(face)
                 corners.append(corner)
         except (ValueError, IndexError) as error:
-            raise TakeError(f"{path}:{number}: expected an OBJ line, found {line[:60]!r}: {error}") from error
+            raise TakeError(
+                f"{path}:{number}: expected an OBJ line, found {line[:60]!r}: {error}"
+            ) from error
     if not positions or not faces:
-        raise TakeError(f"{path}: expected vertices and faces, found {len(positions)} and {len(faces)}")
+        raise TakeError(
+            f"{path}: expected vertices and faces, found {len(positions)} and {len(faces)}"
+        )
     uv = None
     corner_array = np.array(corners, dtype=np.int64)
     if texture and (corner_array[:, :3] >= 0).all():
@@ -128,7 +132,9 @@ def write_obj(path: Path, mesh: Mesh) -> None:
         if mesh.uv is None:
             lines.append("f " + " ".join(str(v + 1) for v in polygon[:count]))
         else:
-            lines.append("f " + " ".join(f"{polygon[k] + 1}/{4 * index + k + 1}" for k in range(count)))
+            lines.append(
+                "f " + " ".join(f"{polygon[k] + 1}/{4 * index + k + 1}" for k in range(count))
+            )
     with replacing(path) as partial:
         partial.write_text("\n".join(lines) + "\n", encoding="utf-8")
 

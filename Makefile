@@ -1,0 +1,32 @@
+# Every target does the set-up it needs first: system libraries, .venv, pinned requirements, ourselves.
+PYTHON := .venv/bin/python
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test test-slow test-landmarks check bench clean
+
+help: ## this list
+	@awk -F':.*## ' '/^[a-z-]+:.*## /{printf "  make %-15s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+
+setup: ## install what is missing; seconds when nothing is
+	@sh tools/setup.sh
+
+demo: setup ## a simulated 16-camera session through every stage, and its report
+	@.venv/bin/likeness demo --out demo
+
+check: setup ## ruff, mypy and import-linter
+	@$(PYTHON) -m tools.check
+
+test: setup check ## checks and every test but the slow ones
+	@$(PYTHON) -m pytest -m "not slow and not gpu and not hardware and not landmarks"
+
+test-slow: setup ## the tests that take more than a minute
+	@$(PYTHON) -m pytest -m "slow"
+
+test-landmarks: setup ## the 68-point detector on the simulated actor; read docs/licences.md first
+	@$(PYTHON) -m pip install --quiet --disable-pip-version-check "face_recognition_models==0.3.0"
+	@$(PYTHON) -m pytest -m "landmarks"
+
+bench: setup ## every benchmark, each with its opponent in the same run
+	@for script in tools/bench/bench_*.py; do echo "== $$script"; $(PYTHON) -m tools.bench.$$(basename $$script .py) || exit 1; done
+
+clean: ## remove the environment and what the demo wrote
+	rm -rf .venv demo build *.egg-info

@@ -1,0 +1,142 @@
+"""`likeness VERB ...`: finds the verb, reads its options, shows progress, reports, exits.
+
+Exit status: 0 done, 2 bad usage or bad input, 1 failure of the work itself, 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import tyro
+
+from capture.errors import InputError, LikenessError
+from capture.product import code_version
+from capture.settings import read_settings
+from tools.progress_bar import ProgressBar
+
+VERBS: dict[str, str] = {
+    "demo": "run a simulated 16-camera session through every stage and report",
+    "import": "make a take of a visiting folder of images",
+    "calibrate": "solve the cameras of an array from a board take",
+    "recon": "reconstruct the surface of frames by stereo",
+    "neutral": "register a template mesh to the actor at the first frame",
+    "track": "track the neutral mesh through a take",
+    "rig": "solve a personalised blendshape rig from performances",
+    "export": "write a rig, a performance or weights in an exchange format",
+    "report": "write the HTML report of a take",
+    "verify": "read a take back and check every frame and the ledger",
+}
+"""Every verb and what it does, in the order of the pipeline."""
+
+_MODULES = {"import": "tools.verbs.visit", "demo": "tools.verbs.demonstrate"}
+_STAGES = {
+    "calibrate": ("recon.calibrate", "CalibrateSettings"),
+    "recon": ("recon.scan", "ReconSettings"),
+    "neutral": ("track.neutral", "NeutralSettings"),
+    "track": ("track.stage", "TrackSettings"),
+    "rig": ("rig.stage", "RigSettings"),
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one verb and return the exit status.
+
+    Args:
+        arguments: the words after `likeness`; those of the process when None.
+    """
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    if not words or words[0] in ("-h", "--help"):
+        print(_overview())
+        return 0 if words else 2
+    if words[0] == "--version":
+        print(f"likeness {code_version()}")
+        return 0
+    verb, rest = words[0], words[1:]
+    if verb not in VERBS:
+        near = difflib.get_close_matches(verb, VERBS, n=1)
+        hint = f"did you mean {near[0]!r}?" if near else f"the verbs are {', '.join(VERBS)}"
+        print(f"likeness: no verb {verb!r}; {hint}", file=sys.stderr)
+        return 2
+    return _run(verb, rest)
+
+
+def _run(verb: str, rest: list[str]) -> int:
+    bar = ProgressBar()
+    try:
+        module = importlib.import_module(_MODULES.get(verb, f"tools.verbs.{verb}"))
+        options = _parse(verb, module, rest)
+        report: dict[str, Any] = module.run(options, bar)
+    except SystemExit as stop:  # tyro prints usage and leaves with 0 (help) or 2 (usage)
+        return stop.code if isinstance(stop.code, int) else 2
+    except KeyboardInterrupt:
+        bar.close()
+        print(f"likeness {verb}: interrupted; what was finished is kept", file=sys.stderr)
+        return 130
+    except LikenessError as error:
+        bar.close()
+        print(f"likeness {verb}: {error}", file=sys.stderr)
+        return error.exit_status
+    except OSError as error:
+        bar.close()
+        print(f"likeness {verb}: {error}", file=sys.stderr)
+        return 1
+    bar.close()
+    if options.json:
+        print(json.dumps(report, default=str))
+    else:
+        for key, value in report.items():
+            print(f"{key}: {value}", file=sys.stderr)
+    return 0
+
+
+def _parse(verb: str, module: ModuleType, rest: list[str]) -> Any:
+    """Options of a verb; with --config, the settings file gives the defaults of the settings."""
+    config = _config_path(rest)
+    prog = f"likeness {verb}"
+    if config is None or verb not in _STAGES:
+        return tyro.cli(module.Arguments, args=rest, prog=prog, description=module.__doc__)
+    stages = {
+        stage: getattr(importlib.import_module(home), name)
+        for stage, (home, name) in _STAGES.items()
+    }
+    settings = read_settings(config, stages)[verb]
+    return tyro.cli(
+        module.Arguments,
+        args=rest,
+        prog=prog,
+        description=module.__doc__,
+        default=module.Arguments(**dict.fromkeys(module.REQUIRED, tyro.MISSING), settings=settings),
+    )
+
+
+def _config_path(rest: list[str]) -> Path | None:
+    for index, word in enumerate(rest):
+        if word == "--config":
+            if index + 1 == len(rest):
+                raise InputError("--config: expected the path of a TOML file after it")
+            return Path(rest[index + 1])
+        if word.startswith("--config="):
+            return Path(word.partition("=")[2])
+    return None
+
+
+def _overview() -> str:
+    width = max(len(verb) for verb in VERBS)
+    lines = [f"  {verb:<{width}}  {text}" for verb, text in VERBS.items()]
+    return (
+        "likeness: from sixteen synchronized views to a personalised face rig\n\n"
+        "usage: likeness VERB ...    (likeness VERB --help tells all of a verb)\n\n"
+        + "\n".join(lines)
+        + "\n\nexample: likeness import visiting-take --out take && likeness recon take --frames 0"
+    )
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,50 @@
+"""Solve the cameras of an array from a board take.
+
+Writes CAMERAS.json, report.json beside it, and a page to look at.
+Example: likeness calibrate takes/board --board board.toml --out cameras.json
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from capture.progress import Progress
+from capture.take import Take
+from recon.board import read_board
+from recon.calibrate import CalibrateSettings, calibrate
+from tools.report import write_calibration_page
+from tools.verbs.options import Options
+
+REQUIRED = ("take", "board", "out")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Arguments(Options):
+    """Options of `likeness calibrate`."""
+
+    take: tyro.conf.Positional[Path]
+    """The board take."""
+    board: Path
+    """The board's TOML file."""
+    out: Path
+    """cameras.json to write."""
+    settings: Annotated[CalibrateSettings, tyro.conf.arg(name="")] = field(
+        default_factory=CalibrateSettings
+    )
+
+
+def run(arguments: Arguments, progress: Progress) -> dict[str, Any]:
+    """Calibrate, draw the page, report the residuals."""
+    take = Take.open(arguments.take)
+    board = read_board(arguments.board)
+    cameras = calibrate(take, board, arguments.settings, arguments.out, progress=progress)
+    report = json.loads(arguments.out.read_text(encoding="utf-8"))["report"]
+    page = arguments.out.with_suffix(".html")
+    write_calibration_page(cameras, report, page)
+    plain = {k: v for k, v in report.items() if isinstance(v, str | int | float | bool)}
+    return {"cameras": str(arguments.out), "page": str(page), "count": len(cameras), **plain}

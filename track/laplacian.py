@@ -13,7 +13,7 @@ from capture.arrays import Floats, Ints, Ints32, check_finite, check_shape
 from capture.errors import SettingsError, ShapeError, SolveError
 from track.rigid import Similarity, fit_similarity, nearest_rotations
 
-_COTANGENT_LIMIT = 20.0  # about 2.9 degrees: slivers may not outweigh their neighbours
+_COTANGENTS = (0.01, 20.0)  # no edge lets go, and no sliver (2.9 degrees) outweighs the rest
 _HOLD = 1e-9  # pull to the start that keeps a constrained component regular
 _HOLD_FREE = 1e-3  # the same for a component that no constraint touches
 
@@ -87,8 +87,8 @@ def cotangent_laplacian(
     Args:
         vertices: (V, 3) mm.
         triangles: (T, 3) vertex indices.
-        clip: force cotangents into 0..20, as quads of production meshes with their obtuse halves
-            and slivers need. Without it L is exact for linear functions and still semi-definite.
+        clip: force cotangents into 0.01..20, as quads of production meshes with their obtuse
+            halves and slivers need. Without it L is exact for linear functions and still semi-definite.
 
     Returns:
         (V, V) csr, dimensionless.
@@ -113,7 +113,7 @@ def cotangent_laplacian(
         dot = np.einsum("tx,tx->t", one, two)
         cotangent = np.divide(dot, area, out=np.zeros_like(dot), where=area > 0.0)
         if clip:
-            cotangent = np.clip(cotangent, 0.0, _COTANGENT_LIMIT)
+            cotangent = np.clip(cotangent, *_COTANGENTS)
         rows += [i, j]
         columns += [j, i]
         values += [0.5 * cotangent, 0.5 * cotangent]
@@ -260,8 +260,8 @@ class LaplacianDeformer:
         """The pull (V,) to the start that makes every component regular."""
         count = int(self._component.max()) + 1
         weights = np.repeat(constraints.weights, 3) * (constraints.barycentric.ravel() != 0.0)
-        held = np.bincount(self._component[constraints.corners.ravel()], weights, minlength=count)
-        held += np.bincount(self._component, prior, minlength=count)
+        touched = np.concatenate([self._component[constraints.corners.ravel()], self._component])
+        held = np.bincount(touched, np.concatenate([weights, prior]), minlength=count)
         return np.where(held > 0.0, _HOLD, _HOLD_FREE)[self._component]
 
     def _rotations(self, vertices: Floats) -> Floats:

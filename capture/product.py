@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import json
 import os
@@ -14,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 _CHUNK = 1 << 20
+_FLOORS = ("capture", "recon", "track", "rig")  # lowest first; names only, nothing is imported
 
 
 @contextmanager
@@ -54,6 +56,9 @@ def hash_file(path: Path) -> str:
 def stage_record(stage: str, settings: Any, inputs: Mapping[str, str]) -> dict[str, Any]:
     """What makes a product what it is: stage, code version, resolved settings, input hashes.
 
+    The code version ends in a digest of the sources of the stage's floor and of those below it, so
+    that a change of the code is seen even where nobody raised the version.
+
     Args:
         stage: the stage's name.
         settings: a dataclass, or None.
@@ -63,7 +68,7 @@ def stage_record(stage: str, settings: Any, inputs: Mapping[str, str]) -> dict[s
     resolved = dataclasses.asdict(settings) if plain else None
     record = {
         "stage": stage,
-        "code": code_version(),
+        "code": f"{code_version()}+{_source_digest(_floor_of(settings))}",
         "settings": resolved,
         "inputs": dict(sorted(inputs.items())),
     }
@@ -100,6 +105,22 @@ def write_record(product: Path, record: Mapping[str, Any]) -> None:
 def record_path(product: Path) -> Path:
     """Where the record of a product stands: `frame_0000.ply` -> `frame_0000.ply.record.json`."""
     return Path(product).with_name(Path(product).name + ".record.json")
+
+
+def _floor_of(settings: Any) -> str:
+    top = type(settings).__module__.partition(".")[0]
+    return top if top in _FLOORS else _FLOORS[-1]
+
+
+@functools.cache
+def _source_digest(floor: str) -> str:
+    digest = hashlib.sha256()
+    house = Path(__file__).resolve().parents[1]
+    for name in _FLOORS[: _FLOORS.index(floor) + 1]:
+        for path in sorted((house / name).rglob("*.py")):
+            digest.update(path.relative_to(house).as_posix().encode() + b"\0")
+            digest.update(path.read_bytes())
+    return digest.hexdigest()[:12]
 
 
 def _remove(path: Path) -> None:

@@ -1,0 +1,172 @@
+"""Synthetic board takes with known truth: an array of cameras, a board waved before it, corner noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from capture.arrays import Floats
+from capture.camera import Camera, CameraArray
+from capture.pose import Pose
+from recon.array_state import ArrayState
+from recon.board import Board
+from recon.observations import BoardObservations
+
+
+@dataclass(frozen=True, kw_only=True)
+class BoardScene:
+    """How a synthetic board take looks.
+
+    Attributes:
+        devices: how many cameras, on an arc of +-62 degrees before the face.
+        size_px: side of the square images.
+        focal_px: mean focal length.
+        radius_mm: distance of the cameras from the face.
+        poses: how many board poses.
+        noise_px: standard deviation of a corner, per coordinate.
+        bow_mm: how far the middle of the board stands out of its plane.
+        outliers: fraction of corners moved by 6 px in a random direction.
+        hidden: fraction of corners not seen.
+        seed: of every random number.
+    """
+
+    devices: int = 16
+    size_px: int = 2048
+    focal_px: float = 4000.0
+    radius_mm: float = 900.0
+    poses: int = 40
+    noise_px: float = 0.1
+    bow_mm: float = 0.0
+    outliers: float = 0.0
+    hidden: float = 0.1
+    seed: int = 0
+
+
+A4_BOARD = Board(
+    squares_x=12, squares_y=9, square_mm=20.0, marker_mm=15.0, dictionary="DICT_5X5_1000"
+)
+
+
+def make_array(scene: BoardScene) -> CameraArray:
+    """Cameras on three rows of an arc, looking at the origin, each with its own lens."""
+    random = np.random.default_rng([scene.seed, 1])
+    cameras = []
+    for index in range(scene.devices):
+        yaw = np.radians(-62.0 + 124.0 * index / max(scene.devices - 1, 1))
+        pitch = np.radians((-18.0, 4.0, 22.0)[index % 3])
+        centre = scene.radius_mm * np.array(
+            [np.sin(yaw) * np.cos(pitch), np.sin(pitch), np.cos(yaw) * np.cos(pitch)]
+        )
+        target = random.normal(0, 8.0, 3)
+        focal = scene.focal_px * (1 + random.normal(0, 0.02))
+        middle = (scene.size_px - 1) / 2 + random.normal(0, 0.004 * scene.size_px, 2)
+        bend = np.array([-0.12 + random.normal(0, 0.01), 0.1 + random.normal(0, 0.03), 0, 0, 0])
+        bend[2:4] = random.normal(0, 3e-4, 2)
+        cameras.append(
+            Camera(
+                name=f"cam{index:02d}",
+                width=scene.size_px,
+                height=scene.size_px,
+                fx=focal,
+                fy=focal * (1 + random.normal(0, 2e-4)),
+                cx=float(middle[0]),
+                cy=float(middle[1]),
+                distortion=bend,
+                camera_from_world=looking_at(centre, target),
+            )  # fmt: skip
+        )
+    return CameraArray(tuple(cameras))
+
+
+def looking_at(centre: Floats, target: Floats) -> Pose:
+    """camera_from_world of a camera at `centre` that looks at `target`, +Y of the world up; mm."""
+    forward = (target - centre) / np.linalg.norm(target - centre)
+    right = np.cross(forward, [0.0, 1.0, 0.0])
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    return Pose(rotation, -rotation @ centre)
+
+
+def make_state(scene: BoardScene, board: Board = A4_BOARD) -> ArrayState:
+    """The true array, board poses and board shape."""
+    random = np.random.default_rng([scene.seed, 2])
+    corners = board.corners_mm()
+    middle = corners.mean(axis=0)
+    across = (corners - middle)[:, :2] / np.abs(corners - middle)[:, :2].max(axis=0)
+    shape = corners.copy()
+    shape[:, 2] += scene.bow_mm * (1.0 - (across**2).sum(axis=1) / 2.0)
+    poses = []
+    for index in range(scene.poses):
+        yaw = np.radians(np.linspace(-50, 50, scene.poses)[index] + random.normal(0, 6.0))
+        pitch = np.radians(random.uniform(-35, 35))
+        spin = np.radians(random.uniform(-25, 25))
+        facing = Pose(
+            np.diag([1.0, -1.0, -1.0]), np.zeros(3)
+        )  # board +Y down, +Z away from the face
+        turn = (
+            Pose.from_rotation_vector(np.array([0, yaw, 0]), random.normal(0, 35.0, 3))
+            @ Pose.from_rotation_vector(np.array([pitch, 0, 0]), np.zeros(3))
+            @ Pose.from_rotation_vector(np.array([0, 0, spin]), np.zeros(3))
+        )
+        poses.append(turn @ facing @ Pose(np.eye(3), -middle))
+    return ArrayState(make_array(scene), tuple(poses), shape)
+
+
+def observe(scene: BoardScene, truth: ArrayState) -> BoardObservations:
+    """What the array sees of the board: corners in the image and facing the camera, with noise."""
+    random = np.random.default_rng([scene.seed, 3])
+    rows: list[tuple[int, int, int, float, float]] = []
+    for pose, array_from_board in enumerate(truth.array_from_board):
+        points = array_from_board.apply(truth.corners)
+        normal = -array_from_board.rotation[:, 2]
+        for device, camera in enumerate(truth.cameras):
+            towards = camera.centre - points.mean(axis=0)
+            if normal @ towards < 0.4 * np.linalg.norm(towards):
+                continue
+            pixels = camera.project(points)
+            margin = (np.abs(pixels - (scene.size_px - 1) / 2) < scene.size_px / 2 - 6).all(axis=1)
+            seen = np.flatnonzero(margin & (random.random(len(points)) >= scene.hidden))
+            if len(seen) < 12:
+                continue
+            noisy = pixels[seen] + random.normal(0, scene.noise_px, (len(seen), 2))
+            wrong = random.random(len(seen)) < scene.outliers
+            angle = random.uniform(0, 2 * np.pi, len(seen))
+            noisy += 6.0 * wrong[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+            rows += [(device, pose, int(n), *p) for n, p in zip(seen, noisy.tolist(), strict=True)]
+    table = np.array(rows)
+    return BoardObservations(
+        device_names=truth.cameras.names,
+        sizes=tuple((camera.width, camera.height) for camera in truth.cameras),
+        frames=tuple(range(scene.poses)),
+        device=table[:, 0].astype(np.int64), pose=table[:, 1].astype(np.int64),
+        corner=table[:, 2].astype(np.int64), pixels=table[:, 3:],
+    )  # fmt: skip
+
+
+def triangulation_error(truth: CameraArray, found: CameraArray, seed: int = 0) -> Floats:
+    """Errors (N, 3), mm, of the face volume triangulated with the found cameras.
+
+    Exact projections of 400 points in a 160 mm ball around the origin by the true cameras are
+    triangulated by the found ones, and the result is aligned rigidly, without scale.
+
+    References:
+        Umeyama 1991 with the scale held at 1.
+    """
+    random = np.random.default_rng([seed, 4])
+    ball = random.normal(size=(400, 3))
+    points = 80.0 * ball / np.linalg.norm(ball, axis=1, keepdims=True)
+    points *= random.random((400, 1)) ** (1 / 3)
+    normal = np.zeros((400, 3, 3))
+    right = np.zeros((400, 3))
+    for one, other in zip(truth, found, strict=True):
+        rays = other.rays(one.project(points))
+        across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
+        normal += across
+        right += across @ other.centre
+    solved = np.linalg.solve(normal, right[:, :, None])[:, :, 0]
+    a, b = solved - solved.mean(axis=0), points - points.mean(axis=0)
+    u, _, vt = np.linalg.svd(a.T @ b)
+    u[:, 2] *= np.linalg.det(u @ vt)
+    error: Floats = a @ (u @ vt) - b
+    return error

@@ -88,7 +88,8 @@ def cotangent_laplacian(
         vertices: (V, 3) mm.
         triangles: (T, 3) vertex indices.
         clip: force cotangents into 0.01..20, as quads of production meshes with their obtuse
-            halves and slivers need. Without it L is exact for linear functions and still semi-definite.
+            halves and slivers need. Without it L is exact for linear functions, and semi-definite
+            all the same.
 
     Returns:
         (V, V) csr, dimensionless.

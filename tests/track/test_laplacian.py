@@ -50,12 +50,9 @@ def constrain(
 
 
 def boundary(triangles: Ints32) -> set[int]:
-    edges: dict[tuple[int, int], int] = {}
-    for triangle in triangles.tolist():
-        for k in range(3):
-            edge = tuple(sorted((triangle[k], triangle[(k + 1) % 3])))
-            edges[edge] = edges.get(edge, 0) + 1  # type: ignore[index, arg-type]
-    return {v for edge, uses in edges.items() if uses == 1 for v in edge}
+    sides = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    edges, uses = np.unique(sides, axis=0, return_counts=True)
+    return set(edges[uses == 1].ravel().tolist())
 
 
 def test_linear_functions_have_no_laplacian_inside_a_flat_mesh() -> None:

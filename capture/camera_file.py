@@ -20,6 +20,7 @@ import numpy as np
 
 from capture.camera import Camera, CameraArray
 from capture.errors import CameraError, LikenessError, raise_all
+from capture.names import is_plain_name
 from capture.pose import Pose
 from capture.product import replacing
 
@@ -115,7 +116,7 @@ def _camera(entry: Any, index: int) -> Camera:
         raise CameraError(f"camera {index}: expected an object, found {type(entry).__name__}")
     label = str(entry.get("name", f"camera {index}"))
     raise_all(label, _key_problems(entry, _REQUIRED, _REQUIRED + _OPTIONAL, "camera"), CameraError)
-    if not isinstance(entry["name"], str) or not _plain(entry["name"]):
+    if not is_plain_name(entry["name"]):
         raise CameraError(
             f"camera {index}: name must be letters, digits, '-', '_' or '.', "
             f"found {entry['name']!r}"
@@ -163,7 +164,3 @@ def _key_problems(
             hint = f"; did you mean {near[0]!r}?" if near else f"; known: {', '.join(known)}"
             problems.append(f"{what}: unknown key {key!r}{hint}")
     return problems
-
-
-def _plain(name: str) -> bool:
-    return bool(name) and not name.startswith(".") and all(c.isalnum() or c in "-_." for c in name)

@@ -1,0 +1,170 @@
+"""take.json: what a take holds, with a format version and a hash of every file."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from capture.errors import LikenessError, TakeError, raise_all
+from capture.mcap import ImageLayout
+from capture.names import is_plain_name
+from capture.product import replacing
+
+FORMAT = "likeness-take"
+VERSION = 1
+_KINDS = ("import", "capture")
+
+
+@dataclass(frozen=True, kw_only=True)
+class DeviceEntry:
+    """One device of a take.
+
+    Attributes:
+        name: unique, safe as a file name.
+        layout: size and pixel type of its frames.
+        frames: how many frames its file holds.
+        sha256: of its file, hex.
+    """
+
+    name: str
+    layout: ImageLayout
+    frames: int
+    sha256: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class TakeManifest:
+    """All that take.json says.
+
+    Attributes:
+        name: the take's name.
+        kind: "import" or "capture".
+        devices: in their fixed order.
+        frame_count: trigger indices 0..frame_count-1 belong to the take.
+        period_ns: time from trigger to trigger; None when it is not known.
+        start_ns: time of trigger 0; None when it is not known.
+        remarks: whatever else the maker wants kept: shot, settings, verdict, source.
+    """
+
+    name: str
+    kind: str
+    devices: tuple[DeviceEntry, ...]
+    frame_count: int
+    period_ns: int | None = None
+    start_ns: int | None = None
+    remarks: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        problems = []
+        if self.kind not in _KINDS:
+            problems.append(f"kind must be one of {', '.join(_KINDS)}, found {self.kind!r}")
+        if not self.devices:
+            problems.append("a take needs at least one device")
+        if self.frame_count < 1:
+            problems.append(f"a take needs at least one frame, found {self.frame_count}")
+        names = [device.name for device in self.devices]
+        problems += [
+            f"device name must be letters, digits, '-', '_' or '.', found {name!r}"
+            for name in names
+            if not is_plain_name(name)
+        ]
+        problems += [
+            f"device {name!r} stands there twice"
+            for name in sorted(set(names))
+            if names.count(name) > 1
+        ]
+        raise_all("manifest", problems, TakeError)
+
+
+def read_manifest(path: Path) -> TakeManifest:
+    """Read take.json.
+
+    Raises:
+        TakeError: naming the file, when it is damaged or was written by a newer version.
+    """
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise TakeError(f"{path}: damaged manifest, not readable as JSON: {error}") from error
+    if not isinstance(document, dict) or document.get("format") != FORMAT:
+        raise TakeError(f'{path}: damaged manifest: expected "format": "{FORMAT}"')
+    version = document.get("version")
+    if not isinstance(version, int) or version < 1:
+        raise TakeError(
+            f"{path}: damaged manifest: version must be a whole number, found {version!r}"
+        )
+    if version > VERSION:
+        raise TakeError(
+            f"{path}: written in format version {version}, this program reads up to {VERSION}; "
+            "update likeness"
+        )
+    try:
+        return _manifest(document)
+    except KeyError as error:
+        raise TakeError(f"{path}: damaged manifest: missing key {error}") from error
+    except (TypeError, ValueError, AttributeError, LikenessError) as error:
+        raise TakeError(f"{path}: damaged manifest: {error}") from error
+
+
+def write_manifest(path: Path, manifest: TakeManifest) -> None:
+    """Write take.json, whole or not at all."""
+    document = {
+        "format": FORMAT,
+        "version": VERSION,
+        "name": manifest.name,
+        "kind": manifest.kind,
+        "frame_count": manifest.frame_count,
+        "period_ns": manifest.period_ns,
+        "start_ns": manifest.start_ns,
+        "devices": [
+            {
+                "name": device.name,
+                "width": device.layout.width,
+                "height": device.layout.height,
+                "channels": device.layout.channels,
+                "dtype": device.layout.dtype,
+                "frames": device.frames,
+                "sha256": device.sha256,
+            }
+            for device in manifest.devices
+        ],
+        "remarks": dict(manifest.remarks),
+    }
+    with replacing(path) as partial:
+        partial.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+
+
+def _manifest(document: Mapping[str, Any]) -> TakeManifest:
+    if not isinstance(document["devices"], list):
+        raise TakeError("devices must be a list")
+    return TakeManifest(
+        name=str(document["name"]),
+        kind=document["kind"],
+        devices=tuple(_device(entry) for entry in document["devices"]),
+        frame_count=_whole(document, "frame_count"),
+        period_ns=_whole(document, "period_ns") if document["period_ns"] is not None else None,
+        start_ns=_whole(document, "start_ns") if document["start_ns"] is not None else None,
+        remarks=dict(document.get("remarks", {})),
+    )
+
+
+def _device(entry: Mapping[str, Any]) -> DeviceEntry:
+    layout = ImageLayout(
+        _whole(entry, "width"), _whole(entry, "height"), _whole(entry, "channels"), entry["dtype"]
+    )
+    return DeviceEntry(
+        name=entry["name"],
+        layout=layout,
+        frames=_whole(entry, "frames"),
+        sha256=str(entry["sha256"]),
+    )
+
+
+def _whole(entry: Mapping[str, Any], key: str) -> int:
+    value = entry[key]
+    if not isinstance(value, int) or isinstance(value, bool):
+        raise TakeError(f"{key} must be a whole number, found {value!r}")
+    return value

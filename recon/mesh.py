@@ -123,8 +123,8 @@ def read_obj(path: Path) -> Mesh:
 
 
 def write_obj(path: Path, mesh: Mesh) -> None:
-    """Write an OBJ file, whole or not at all; vertex order, quads and uv are kept."""
-    lines = [f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in mesh.vertices.tolist()]
+    """Write an OBJ file, whole or not at all; vertex order, quads, uv and float32 are kept."""
+    lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in mesh.vertices.tolist()]
     if mesh.uv is not None:
         lines += [f"vt {u:.7f} {v:.7f}" for u, v in mesh.uv.reshape(-1, 2).tolist()]
     for index, polygon in enumerate(mesh.polygons.tolist()):

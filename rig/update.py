@@ -1,0 +1,324 @@
+"""The blendshape update: neutral and shapes from frames whose weights and head motion are known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numba
+import numpy as np
+from scipy import sparse
+
+from capture.arrays import Bools, Floats, Ints, Ints32, check_shape
+from capture.errors import SolveError
+from rig.gradient import gradient_operator
+from rig.transfer import factorised
+
+_DIRECT_UNKNOWNS = 12_000  # up to here one sparse factorisation is faster than iterating
+
+
+@dataclass(frozen=True, kw_only=True)
+class UpdatePriors:
+    """How far shapes may move from their targets.
+
+    Attributes:
+        gradient_mm2: lambda_r, the strength of E_r = |G (D - D*)|^2. Gradients are integrated over the
+            mesh and divided by the mean area of a vertex, so the strength is in mm^2 and does not
+            depend on how finely the face is meshed: sqrt(gradient / offset) is the distance, in mm,
+            over which corrections are smoothed.
+        offset: lambda_d, the strength of E_d = |D - D*|^2 (1: one sure observation at weight 1).
+        neutral_offset: the same for the neutral's column.
+        tolerance: relative residual at which iterating ends.
+        iterations: most steps of the iterative solver.
+    """
+
+    gradient_mm2: float = 1.0
+    offset: float = 0.05
+    neutral_offset: float = 0.05
+    tolerance: float = 1e-8
+    iterations: int = 2000
+
+
+@dataclass(frozen=True, eq=False)
+class UpdateSystem:
+    """The normal equations of Ma et al. Eq 7 on the active unknowns, vertex by vertex.
+
+    Unknown n is column `columns[n]` (0 the neutral, k + 1 shape k) of the vertex whose range
+    `starts[v]:starts[v + 1]` holds it; x, y and z share the matrix.
+
+    Attributes:
+        starts: (V + 1,) ranges of unknowns.
+        columns: (N,) column of each unknown, ascending within a vertex.
+        position: (V, B + 1) number of each unknown, -1 where the mask holds it at zero.
+        block_starts: (V + 1,) where each vertex's dense block begins in `blocks`.
+        blocks: the dense blocks, row by row: data and offset terms.
+        laplacian: (V, V) already scaled by the gradient strength.
+        right: (N, 3) right-hand side for the departure from the targets.
+    """
+
+    starts: Ints
+    columns: Ints
+    position: Ints
+    block_starts: Ints
+    blocks: Floats
+    laplacian: sparse.csr_array
+    right: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """Frames brought back to rig space, with what is known of them.
+
+    Attributes:
+        offsets: (F, V, 3) points minus the neutral, head motion undone, mm.
+        confidence: (F, V) 0..1, squared inside.
+        weights: (F, B).
+    """
+
+    offsets: Floats
+    confidence: Floats
+    weights: Floats
+
+
+def update_shapes(
+    neutral: Floats,
+    triangles: Ints32,
+    targets: Floats,
+    support: Bools,
+    evidence: Evidence,
+    priors: UpdatePriors,
+) -> tuple[Floats, Floats]:
+    """Solve Ma et al. Eq 7 with the neutral column: new neutral and shapes, all coordinates at once.
+
+    Args:
+        neutral: (V, 3) current neutral, mm.
+        triangles: (T, 3).
+        targets: (B, V, 3) D*, the transferred shapes, mm; zero outside the support.
+        support: (B, V) where each shape may move; the neutral's column is exempt.
+        evidence: the frames.
+        priors: strengths.
+
+    Returns:
+        neutral (V, 3) and shapes (B, V, 3), mm, in the rig space of the input.
+
+    Raises:
+        SolveError: when the iteration does not reach its tolerance.
+
+    References:
+        Ma et al. 2016, section 3.2, Eqs 5-7 and "Neutral Vertex Positions".
+    """
+    check_shape(
+        neutral=(neutral, "V 3"), targets=(targets, "B V 3"), support=(support, "B V"),
+        offsets=(evidence.offsets, "F V 3"), confidence=(evidence.confidence, "F V"),
+        weights=(evidence.weights, "F B"),
+    )  # fmt: skip
+    system = assemble(neutral, triangles, targets, support, evidence, priors)
+    if len(system.columns) <= _DIRECT_UNKNOWNS:
+        change = solve_direct(system)
+    else:
+        change = solve_iterative(system, priors.tolerance, priors.iterations)
+    full = np.zeros((len(neutral), len(targets) + 1, 3))
+    full[system.position >= 0] = change
+    moved = full.transpose(1, 0, 2)
+    return neutral + moved[0], targets + moved[1:]
+
+
+def assemble(
+    neutral: Floats,
+    triangles: Ints32,
+    targets: Floats,
+    support: Bools,
+    evidence: Evidence,
+    priors: UpdatePriors,
+) -> UpdateSystem:
+    """Build the normal equations for the departure of neutral and shapes from their targets.
+
+    Arguments as of `update_shapes`.
+    """
+    operator = gradient_operator(neutral, triangles)
+    area = float((operator.multiply(operator)).sum())  # only its being finite and > 0 matters here
+    if not area > 0.0:
+        raise SolveError("blendshape update: every triangle of the neutral has zero area")
+    vertex_area = mean_vertex_area(neutral, triangles)
+    laplacian = sparse.csr_array((operator.T @ operator) * (priors.gradient_mm2 / vertex_area))
+    laplacian.sort_indices()
+    active = np.concatenate([np.ones((1, len(neutral)), dtype=bool), support]).T
+    counts = active.sum(axis=1)
+    starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    columns = np.nonzero(active)[1].astype(np.int64)
+    position = np.full(active.shape, -1, dtype=np.int64)
+    position[active] = np.arange(len(columns))
+    block_starts = np.concatenate([[0], np.cumsum(counts**2)]).astype(np.int64)
+    factors = np.concatenate([np.ones((len(evidence.weights), 1)), evidence.weights], axis=1)
+    residual = evidence.offsets - np.tensordot(evidence.weights, targets, axes=1)
+    stiffness = np.full(len(targets) + 1, priors.offset)
+    stiffness[0] = priors.neutral_offset
+    square = np.asarray(evidence.confidence, dtype=np.float64) ** 2
+    blocks = np.empty(int(block_starts[-1]))
+    right = np.empty((len(columns), 3))
+    _fill(starts, columns, block_starts, square.T.copy(), factors,
+          np.ascontiguousarray(residual.transpose(1, 0, 2)), stiffness, blocks, right)  # fmt: skip
+    return UpdateSystem(starts, columns, position, block_starts, blocks, laplacian, right)
+
+
+def mean_vertex_area(vertices: Floats, triangles: Ints32) -> float:
+    """Area of the mesh divided by its vertex count, mm^2."""
+    corner = vertices[triangles]
+    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    return float(np.linalg.norm(normal, axis=1).sum() / 2.0 / len(vertices))
+
+
+def solve_direct(system: UpdateSystem) -> Floats:
+    """Factorise the active system once and solve x, y and z with it: (N, 3)."""
+    counts = np.diff(system.starts)
+    owner = np.repeat(np.arange(len(counts)), counts)
+    rows = np.repeat(np.arange(len(system.columns)), counts[owner])
+    within = np.arange(len(rows)) - np.repeat(system.block_starts[:-1], counts**2)
+    cols = np.repeat(system.starts[:-1], counts**2) + within % np.repeat(counts, counts**2)
+    coupling = system.laplacian.tocoo()
+    pair = system.position[coupling.row], system.position[coupling.col]
+    both = (pair[0] >= 0) & (pair[1] >= 0)
+    data = np.broadcast_to(coupling.data[:, None], both.shape)[both]
+    matrix = sparse.coo_array(
+        (
+            np.concatenate([system.blocks, data]),
+            (np.concatenate([rows, pair[0][both]]), np.concatenate([cols, pair[1][both]])),
+        ),
+        shape=(len(system.columns),) * 2,
+    )
+    solved: Floats = factorised(matrix).solve(system.right)
+    return solved
+
+
+def solve_iterative(system: UpdateSystem, tolerance: float, iterations: int) -> Floats:
+    """Conjugate gradients on the active system, preconditioned by each vertex's block: (N, 3).
+
+    Raises:
+        SolveError: when the relative residual stays above `tolerance`.
+    """
+    lap = system.laplacian
+    inverse = np.empty_like(system.blocks)
+    _invert(system.starts, system.block_starts, system.blocks, lap.diagonal(), inverse)
+    matrix = (system.starts, system.columns, system.block_starts, system.blocks)
+    mesh = (system.position, lap.indptr, lap.indices, lap.data)
+    solved = np.zeros_like(system.right)
+    residual = system.right.copy()
+    goal = tolerance * np.maximum(np.sqrt((residual**2).sum(axis=0)), 1e-300)
+    step = np.empty_like(residual)
+    _precondition(system.starts, system.block_starts, inverse, residual, step)
+    direction = step.copy()
+    product = np.empty_like(residual)
+    energy = (residual * step).sum(axis=0)
+    for _ in range(iterations):
+        if (np.sqrt((residual**2).sum(axis=0)) <= goal).all():
+            return solved
+        _multiply(*matrix, *mesh, direction, product)
+        curvature = (direction * product).sum(axis=0)
+        length = np.where(curvature > 0.0, energy / np.where(curvature > 0.0, curvature, 1.0), 0.0)
+        solved += length * direction
+        residual -= length * product
+        _precondition(system.starts, system.block_starts, inverse, residual, step)
+        renewed = (residual * step).sum(axis=0)
+        direction *= np.where(energy > 0.0, renewed / np.where(energy > 0.0, energy, 1.0), 0.0)
+        direction += step
+        energy = renewed
+    reached = float((np.sqrt((residual**2).sum(axis=0)) / goal).max() * tolerance)
+    raise SolveError(
+        f"blendshape update: relative residual {reached:.2g} after {iterations} iterations, "
+        f"asked for {tolerance:.2g}; raise the offset strength or the tolerance"
+    )
+
+
+@numba.njit(cache=True, parallel=True)
+def _fill(
+    starts: Any, columns: Any, block_starts: Any, square: Any, factors: Any, residual: Any,
+    stiffness: Any, blocks: Any, right: Any,
+) -> None:  # fmt: skip
+    """Per vertex: sum_f m^2 w w^T + stiffness, and sum_f m^2 w residual."""
+    frames = factors.shape[0]
+    for v in numba.prange(starts.shape[0] - 1):
+        n = starts[v + 1] - starts[v]
+        base = block_starts[v]
+        for i in range(n):
+            a = columns[starts[v] + i]
+            for j in range(i + 1):
+                b = columns[starts[v] + j]
+                total = stiffness[a] if i == j else 0.0
+                for f in range(frames):
+                    total += square[v, f] * factors[f, a] * factors[f, b]
+                blocks[base + i * n + j] = total
+                blocks[base + j * n + i] = total
+            for c in range(3):
+                total = 0.0
+                for f in range(frames):
+                    total += square[v, f] * factors[f, a] * residual[v, f, c]
+                right[starts[v] + i, c] = total
+
+
+@numba.njit(cache=True, parallel=True)
+def _invert(starts: Any, block_starts: Any, blocks: Any, diagonal: Any, inverse: Any) -> None:
+    """Invert each vertex's block, its Laplacian diagonal added, by Gauss-Jordan (it is SPD)."""
+    for v in numba.prange(starts.shape[0] - 1):
+        n = starts[v + 1] - starts[v]
+        base = block_starts[v]
+        a = np.empty((n, n))
+        for i in range(n):
+            for j in range(n):
+                a[i, j] = blocks[base + i * n + j]
+            a[i, i] += diagonal[v]
+        for p in range(n):
+            pivot = 1.0 / a[p, p]
+            a[p, p] = 1.0
+            for j in range(n):
+                a[p, j] *= pivot
+            for i in range(n):
+                if i != p:
+                    factor = a[i, p]
+                    a[i, p] = 0.0
+                    for j in range(n):
+                        a[i, j] -= factor * a[p, j]
+        for i in range(n):
+            for j in range(n):
+                inverse[base + i * n + j] = 0.5 * (a[i, j] + a[j, i])
+
+
+@numba.njit(cache=True, parallel=True)
+def _precondition(starts: Any, block_starts: Any, inverse: Any, x: Any, out: Any) -> None:
+    for v in numba.prange(starts.shape[0] - 1):
+        first = starts[v]
+        n = starts[v + 1] - first
+        base = block_starts[v]
+        for i in range(n):
+            sx, sy, sz = 0.0, 0.0, 0.0
+            for j in range(n):
+                value = inverse[base + i * n + j]
+                sx += value * x[first + j, 0]
+                sy += value * x[first + j, 1]
+                sz += value * x[first + j, 2]
+            out[first + i, 0], out[first + i, 1], out[first + i, 2] = sx, sy, sz
+
+
+@numba.njit(cache=True, parallel=True)
+def _multiply(
+    starts: Any, columns: Any, block_starts: Any, blocks: Any,
+    position: Any, indptr: Any, indices: Any, data: Any, x: Any, out: Any,
+) -> None:  # fmt: skip
+    for v in numba.prange(starts.shape[0] - 1):
+        first = starts[v]
+        n = starts[v + 1] - first
+        base = block_starts[v]
+        for i in range(n):
+            sx, sy, sz = 0.0, 0.0, 0.0
+            for j in range(n):
+                value = blocks[base + i * n + j]
+                sx += value * x[first + j, 0]
+                sy += value * x[first + j, 1]
+                sz += value * x[first + j, 2]
+            k = columns[first + i]
+            for e in range(indptr[v], indptr[v + 1]):
+                at = position[indices[e], k]
+                if at >= 0:
+                    sx += data[e] * x[at, 0]
+                    sy += data[e] * x[at, 1]
+                    sz += data[e] * x[at, 2]
+            out[first + i, 0], out[first + i, 1], out[first + i, 2] = sx, sy, sz

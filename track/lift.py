@@ -1,0 +1,152 @@
+"""Lifting: flow of many views into one motion of each surface sample, by robust triangulation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numba
+import numpy as np
+
+from capture.arrays import Floats, Ints, Ints32, check_shape
+
+_ITERATIONS = 6
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Observations:
+    """Where views say that samples have moved to; L of them, in any order.
+
+    Attributes:
+        sample: (L,) int32 which of the N samples.
+        offset: (L, 2) px, from the image of the sample's estimate to its match.
+        jacobian: (L, 2, 3) px per mm of the projection at the estimate.
+        information: (L, 3) xx, xy, yy of the inverse covariance of `offset`, px^-2.
+    """
+
+    sample: Ints32
+    offset: Floats
+    jacobian: Floats
+    information: Floats
+
+    def __post_init__(self) -> None:
+        check_shape(
+            sample=(self.sample, "L"),
+            offset=(self.offset, "L 2"),
+            jacobian=(self.jacobian, "L 2 3"),
+            information=(self.information, "L 3"),
+        )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Lifted:
+    """Motions of N samples.
+
+    Attributes:
+        motion: (N, 3) mm from the estimate; 0 where no view agrees.
+        information: (N,) mm^-2, the least of the three principal informations along which the
+            views see the point, or the middle one where one view alone sees it.
+        views: (N,) int64 how many views agree on it.
+        residual_px: (N,) median distance between matches and the projected result; NaN for none.
+    """
+
+    motion: Floats
+    information: Floats
+    views: Ints
+    residual_px: Floats
+
+
+def triangulate(observations: Observations, count: int, scale_px: float, prior_mm: float) -> Lifted:
+    """Triangulate every sample from its views, robustly.
+
+    Minimises sum_l rho(|J_l x - o_l|) in each observation's metric plus |x|^2 / prior^2 by
+    reweighted least squares with Geman and McClure's rho; the projection is linear over the
+    millimetres that are left to move. The prior, weak beside any second view, keeps a sample that
+    one view alone sees at its depth: it then moves across that view only.
+
+    Args:
+        observations: L matches.
+        count: N.
+        scale_px: the residual at which a match has lost three quarters of its weight.
+        prior_mm: standard deviation of the prior.
+
+    References:
+        Geman and McClure 1987; Hartley and Sturm 1997 for triangulation in the image's metric.
+    """
+    order = np.argsort(observations.sample, kind="stable")
+    starts = np.searchsorted(observations.sample[order], np.arange(count + 1))
+    motion, information, views, residual = _triangulate(
+        starts,
+        observations.offset[order],
+        observations.jacobian[order],
+        observations.information[order],
+        scale_px,
+        1.0 / prior_mm**2,
+    )
+    return Lifted(motion=motion, information=information, views=views, residual_px=residual)
+
+
+@numba.njit(cache=True, parallel=True)
+def _triangulate(
+    starts: Any, offset: Any, jacobian: Any, information: Any, scale: float, prior: float
+) -> tuple[Any, Any, Any, Any]:
+    count = len(starts) - 1
+    motion = np.zeros((count, 3))
+    strength = np.zeros(count)
+    views = np.zeros(count, np.int64)
+    residual = np.full(count, np.nan)
+    for n in numba.prange(count):
+        low, high = starts[n], starts[n + 1]
+        if low == high:
+            continue
+        weight = np.ones(high - low)
+        x = np.zeros(3)
+        normal = np.empty((3, 3))
+        right = np.empty(3)
+        miss = np.empty(high - low)
+        for _ in range(_ITERATIONS):
+            _accumulate(low, high, offset, jacobian, information, weight, prior, normal, right)
+            x = np.linalg.solve(normal, right)
+            for k in range(low, high):
+                u = jacobian[k, 0, 0] * x[0] + jacobian[k, 0, 1] * x[1] + jacobian[k, 0, 2] * x[2]
+                v = jacobian[k, 1, 0] * x[0] + jacobian[k, 1, 1] * x[1] + jacobian[k, 1, 2] * x[2]
+                miss[k - low] = np.hypot(u - offset[k, 0], v - offset[k, 1])
+                weight[k - low] = 1.0 / (1.0 + (miss[k - low] / scale) ** 2) ** 2
+        agree = miss[weight > 0.25]
+        views[n] = len(agree)
+        if len(agree) == 0:
+            continue
+        motion[n] = x
+        residual[n] = np.median(agree)
+        _accumulate(low, high, offset, jacobian, information, weight, 0.0, normal, right)
+        principal = np.linalg.eigvalsh(normal)
+        strength[n] = principal[0] if len(agree) > 1 else principal[1]
+    return motion, strength, views, residual
+
+
+@numba.njit(cache=True)
+def _accumulate(
+    low: int,
+    high: int,
+    offset: Any,
+    jacobian: Any,
+    information: Any,
+    weight: Any,
+    prior: float,
+    normal: Any,
+    right: Any,
+) -> None:
+    """Normal equations of one sample."""
+    for a in range(3):
+        right[a] = 0.0
+        for b in range(3):
+            normal[a, b] = prior if a == b else 0.0
+    for k in range(low, high):
+        w = weight[k - low]
+        xx, xy, yy = w * information[k, 0], w * information[k, 1], w * information[k, 2]
+        for a in range(3):
+            u = xx * jacobian[k, 0, a] + xy * jacobian[k, 1, a]
+            v = xy * jacobian[k, 0, a] + yy * jacobian[k, 1, a]
+            right[a] += u * offset[k, 0] + v * offset[k, 1]
+            for b in range(3):
+                normal[a, b] += u * jacobian[k, 0, b] + v * jacobian[k, 1, b]

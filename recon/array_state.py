@@ -1,4 +1,4 @@
-"""`ArrayState`: what a calibration solves for: lenses and places of cameras, board poses, board shape."""
+"""`ArrayState`: what a calibration solves for: lenses, places, board poses, board shape."""
 
 from __future__ import annotations
 

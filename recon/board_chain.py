@@ -1,4 +1,4 @@
-"""A first guess of the whole array: nominal lenses, IPPE poses, medoid relative poses along a tree."""
+"""A first guess of the array: nominal lenses, IPPE poses, medoid relative poses along a tree."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class _View:
 def initial_state(
     observations: BoardObservations, corners: Floats, focal_guess: float | None = None
 ) -> ArrayState:
-    """Estimate lenses, camera places and board poses well enough for a bundle adjustment to converge.
+    """Estimate lenses, camera places and board poses well enough to start a bundle adjustment.
 
     Args:
         observations: corner sightings.
@@ -126,7 +126,8 @@ def _linear_focal(observations: BoardObservations, corners: Floats, device: int)
     flat, tilt = [], []
     for rows in _device_views(observations, device):
         xy = corners[observations.corner[rows], :2]
-        homography, _ = cv2.findHomography(xy, observations.pixels[rows] - centre, 0)
+        found, _ = cv2.findHomography(xy, observations.pixels[rows] - centre, 0)
+        homography: Floats | None = found  # OpenCV gives None for degenerate corners
         if homography is None:
             continue
         first, second = homography[:, 0], homography[:, 1]
@@ -187,7 +188,9 @@ def _pose_candidates(
         candidates = []
         for turn, shift in zip(turns[:found], shifts[:found], strict=True):
             if np.isfinite(turn).all() and np.isfinite(shift).all() and shift[2, 0] > 0:
-                moved = Pose.from_rotation_vector(turn[:, 0], shift[:, 0])
+                moved = Pose.from_rotation_vector(
+                    turn[:, 0].astype(np.float64), shift[:, 0].astype(np.float64)
+                )
                 candidates.append(moved @ Pose(np.eye(3), -middle))
         if candidates:
             views.append(_View(device, pose, tuple(candidates), int(seen.sum())))
@@ -195,7 +198,7 @@ def _pose_candidates(
 
 
 def _spanning_tree(observations: BoardObservations) -> tuple[dict[int, int], list[int]]:
-    """Maximum spanning tree over devices weighted by shared corners: parents, and root-first order."""
+    """Maximum spanning tree over devices by shared corners: parents, and root-first order."""
     counts = observations.view_counts().astype(np.float64)
     shared = np.array([[np.minimum(a, b).sum() for b in counts] for a in counts])
     np.fill_diagonal(shared, 0.0)

@@ -1,8 +1,8 @@
 """The seam to COLMAP: models in and out, and bundle adjustment of an array in the board's frame.
 
-The only module that imports pycolmap. COLMAP puts the centre of the first pixel at 0.5, we put it at
-0: that half pixel is added to keypoints and principal points on the way in, taken away on the way
-out, here and nowhere else.
+The only module that imports pycolmap. COLMAP puts the centre of the first pixel at 0.5, we put it
+at 0: that half pixel is added to keypoints and principal points on the way in, taken away on the
+way out, here and nowhere else.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class Adjustment:
 def adjust_array(
     state: ArrayState, observations: BoardObservations, options: AdjustOptions
 ) -> Adjustment:
-    """Adjust lenses, places, board poses and board shape so that corners project where they were seen.
+    """Adjust lenses, places, board poses and board shape until corners project where seen.
 
     A moving board before a static array is a static board before a moving array: one COLMAP rig of
     C sensors, one frame a board pose, and the corners as the points all frames share.
@@ -146,14 +146,16 @@ def from_colmap(camera: pycolmap.Camera, name: str, camera_from_world: Pose) -> 
     model = camera.model.name
     if model not in _PARAMETERS:
         raise CameraError(
-            f"{name}: camera model {model} is not supported; convert it to one of {', '.join(_PARAMETERS)}"
+            f"{name}: camera model {model} is not supported; "
+            f"convert it to one of {', '.join(_PARAMETERS)}"
         )
     params = [float(value) for value in camera.params]
     fx, fy, cx, cy, *bend = (0.0 if at is None else params[at] for at in _PARAMETERS[model])
     k3 = params[8] if model == "FULL_OPENCV" else 0.0
     if model == "FULL_OPENCV" and any(params[9:12]):
         raise CameraError(
-            f"{name}: FULL_OPENCV with k4, k5, k6 = {params[9:12]}; only k1 k2 p1 p2 k3 are supported"
+            f"{name}: FULL_OPENCV with k4, k5, k6 = {params[9:12]}; "
+            "only k1 k2 p1 p2 k3 are supported"
         )
     return Camera(
         name=name, width=int(camera.width), height=int(camera.height), fx=fx, fy=fy,
@@ -166,8 +168,8 @@ def read_model(folder: Path) -> CameraArray:
     """Read the cameras of a COLMAP sparse model, text or binary.
 
     A camera is named after the folder its images lie in, or, when all images lie in one folder,
-    after its image. The world is the model's, its unit taken as a millimetre: a model in metres must
-    be scaled before.
+    after its image. The world is the model's, its unit taken as a millimetre: a model in metres
+    must be scaled before.
 
     Args:
         folder: holding cameras, images and points3D as .bin or .txt.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -46,7 +47,7 @@ class BoardObservations:
         if len(self.sizes) != len(self.device_names):
             raise ShapeError(f"sizes: expected {len(self.device_names)}, found {len(self.sizes)}")
         for key, limit in (("device", len(self.device_names)), ("pose", len(self.frames))):
-            if len(pixels) and not (0 <= columns[key].min() and columns[key].max() < limit):
+            if len(pixels) and (columns[key].min() < 0 or columns[key].max() >= limit):
                 raise ShapeError(f"{key}: indices must lie in 0..{limit - 1}")
         order = np.lexsort((columns["corner"], columns["pose"], columns["device"]))
         for key, values in (*columns.items(), ("pixels", pixels)):
@@ -72,7 +73,7 @@ class BoardObservations:
             return
         change = np.flatnonzero((np.diff(self.device) != 0) | (np.diff(self.pose) != 0)) + 1
         starts = [0, *change.tolist(), len(self)]
-        for start, stop in zip(starts[:-1], starts[1:], strict=True):
+        for start, stop in pairwise(starts):
             yield int(self.device[start]), int(self.pose[start]), slice(start, stop)
 
     def view_counts(self) -> Ints:

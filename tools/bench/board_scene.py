@@ -1,4 +1,4 @@
-"""Synthetic board takes with known truth: an array of cameras, a board waved before it, corner noise."""
+"""Synthetic board takes with known truth: an array of cameras, a waved board, corner noise."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def make_array(scene: BoardScene) -> CameraArray:
                 cy=float(middle[1]),
                 distortion=bend,
                 camera_from_world=looking_at(centre, target),
-            )  # fmt: skip
+            )
         )
     return CameraArray(tuple(cameras))
 

@@ -23,6 +23,7 @@ from capture.camera import CameraArray
 from capture.camera_file import read_cameras, write_cameras
 from capture.errors import CameraError, TakeError, raise_all
 from capture.frame import Frame, FrameSet
+from capture.ledger import Ledger, read_ledger
 from capture.manifest import DeviceEntry, TakeManifest, read_manifest
 from capture.mcap import FrameReader
 from capture.product import hash_file
@@ -139,7 +140,8 @@ class Take:
         if not self.has_cameras:
             raise CameraError(
                 f"{self.folder}: this take has no cameras.json; calibrate a board take of "
-                f"the same array with `likeness calibrate BOARD_TAKE --board BOARD.toml --out {path}`"
+                "the same array with "
+                f"`likeness calibrate BOARD_TAKE --board BOARD.toml --out {path}`"
             )
         array = read_cameras(path)
         self._check_cameras(array, str(path))
@@ -172,6 +174,10 @@ class Take:
             )
         return path
 
+    def ledger(self) -> Ledger:
+        """The verdict of every (trigger index, device) pair."""
+        return read_ledger(self.folder / "ledger.csv")
+
     def frames_hash(self) -> str:
         """A hash of all frames, from the manifest: it does not read them."""
         digest = hashlib.sha256()
@@ -196,7 +202,11 @@ class Take:
                 raise TakeError(
                     f"{reader.path}: holds frames of {reader.layout}, take.json says {entry.layout}"
                 )
-            places = {header.trigger_index: place for place, header in enumerate(reader.headers)}
+            places = {
+                header.trigger_index: place
+                for place, header in enumerate(reader.headers)
+                if header.status == 0
+            }
             self._readers[device] = (reader, places)
         return self._readers[device]
 

@@ -18,6 +18,7 @@ from pathlib import Path
 
 from capture.camera_file import write_cameras
 from capture.errors import TakeError
+from capture.ledger import all_present, write_ledger
 from capture.manifest import DeviceEntry, TakeManifest
 from capture.mcap import FrameHeader
 from capture.product import record_path, replacing, stage_record, write_record
@@ -97,7 +98,9 @@ def _write(visit: Visit, name: str, folder: Path, progress: Progress) -> None:
                 remarks={"first_source_number": visit.first_number},
             )
 
-        writer.finish(describe)
+        manifest = writer.finish(describe)
+    names = [device.name for device in manifest.devices]
+    write_ledger(folder / "ledger.csv", all_present(names, count))
     if visit.cameras_file is not None:
         shutil.copyfile(visit.cameras_file, folder / "cameras.json")
     elif visit.cameras is not None:

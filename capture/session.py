@@ -1,0 +1,280 @@
+"""`Session`: the takes of one day with one actor, and how they are recorded.
+
+::
+
+    SESSION/session.json                  format version and name
+    SESSION/takes/<slate>_<take number>/  one folder a take; a retake gets the next number
+
+Nothing is ever deleted: of several takes of a slate, the one with the highest number counts,
+and the others are superseded.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from capture.devices.protocol import DeviceArray
+from capture.errors import SettingsError, TakeError, raise_all
+from capture.judgement import Judgement, judge
+from capture.ledger import write_ledger
+from capture.manifest import DeviceEntry, TakeManifest
+from capture.names import is_plain_name
+from capture.product import replacing
+from capture.progress import Progress, silent
+from capture.recorder import Recording, RecordSettings, record_frames
+from capture.take import Take
+from capture.take_writer import TakeWriter
+
+FORMAT = "likeness-session"
+VERSION = 1
+_KINDS = ("board", "neutral", "expression")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shot:
+    """One thing to record.
+
+    Attributes:
+        slate: its name, safe as a file name.
+        kind: "board", "neutral" or "expression".
+        frames: how many.
+        start_ns: when trigger 0 is sent, by the line's clock; None: as soon as all is ready.
+        hold: first and last frame of the part that must be whole, or None.
+    """
+
+    slate: str
+    kind: str
+    frames: int
+    start_ns: int | None = None
+    hold: tuple[int, int] | None = None
+
+    def __post_init__(self) -> None:
+        problems = []
+        if not is_plain_name(self.slate):
+            problems.append(f"slate must be letters, digits, '-', '_' or '.', found {self.slate!r}")
+        if self.kind not in _KINDS:
+            problems.append(f"kind must be one of {', '.join(_KINDS)}, found {self.kind!r}")
+        if self.frames < 1:
+            problems.append(f"frames must be at least 1, found {self.frames}")
+        if self.hold is not None and not 0 <= self.hold[0] <= self.hold[1] < self.frames:
+            problems.append(f"hold must lie within frames 0..{self.frames - 1}, found {self.hold}")
+        raise_all(f"shot {self.slate!r}", problems, SettingsError)
+
+
+@dataclass(frozen=True)
+class ShotList:
+    """What is to be recorded, in order; slates are unique."""
+
+    shots: tuple[Shot, ...]
+
+    def __post_init__(self) -> None:
+        slates = [shot.slate for shot in self.shots]
+        double = sorted({slate for slate in slates if slates.count(slate) > 1})
+        if double:
+            raise SettingsError(
+                f"shot list: slates must be unique, found twice: {', '.join(double)}"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class TakeNote:
+    """One take of a session.
+
+    Attributes:
+        slate: of its shot.
+        take_number: from 1, in the order of recording.
+        kind: of its shot.
+        folder: where it stands.
+        colour: "green", "amber" or "red".
+        sentence: why, in plain words.
+        superseded: whether there is a later take of the slate.
+    """
+
+    slate: str
+    take_number: int
+    kind: str
+    folder: Path
+    colour: str
+    sentence: str
+    superseded: bool
+
+
+@dataclass(frozen=True)
+class Session:
+    """A session folder. Make one with `Session.create`, open one with `Session.open`."""
+
+    folder: Path
+    name: str
+
+    @classmethod
+    def create(cls, folder: Path, name: str | None = None) -> Session:
+        """Make a session folder, or open the one that is there.
+
+        Args:
+            folder: the folder to make.
+            name: the session's name; the folder's when not given.
+
+        Raises:
+            TakeError: when something else stands there.
+        """
+        folder = Path(folder)
+        if (folder / "session.json").exists():
+            return cls.open(folder)
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise TakeError(f"{folder}: exists and is not a session; choose another folder")
+        session = cls(folder, name if name is not None else folder.name)
+        (folder / "takes").mkdir(parents=True, exist_ok=True)
+        document = {"format": FORMAT, "version": VERSION, "name": session.name}
+        with replacing(folder / "session.json") as partial:
+            partial.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+        return session
+
+    @classmethod
+    def open(cls, folder: Path) -> Session:
+        """Open a session folder.
+
+        Raises:
+            TakeError: when it is not one, is damaged, or was written by a newer version.
+        """
+        path = Path(folder) / "session.json"
+        if not path.is_file():
+            raise TakeError(f"{folder}: expected a session, found no session.json")
+        try:
+            document = json.loads(path.read_text(encoding="utf-8"))
+        except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+            raise TakeError(f"{path}: not readable as JSON: {error}") from error
+        if not isinstance(document, dict) or document.get("format") != FORMAT:
+            raise TakeError(f'{path}: expected "format": "{FORMAT}"')
+        version = document.get("version")
+        if not isinstance(version, int) or version > VERSION:
+            raise TakeError(
+                f"{path}: written in format version {version!r}, this program reads up to "
+                f"{VERSION}; update likeness"
+            )
+        return cls(Path(folder), str(document.get("name", Path(folder).name)))
+
+    def takes(self) -> tuple[TakeNote, ...]:
+        """All takes, slates in order of name and takes in order of number."""
+        found: list[tuple[str, int, Path, dict[str, Any]]] = []
+        for folder in sorted((self.folder / "takes").glob("*/take.json")):
+            remarks = dict(Take.open(folder.parent).manifest.remarks)
+            if "shot" in remarks and "take_number" in remarks:
+                found.append(
+                    (remarks["shot"]["slate"], remarks["take_number"], folder.parent, remarks)
+                )
+        latest = {slate: number for slate, number, _, _ in sorted(found, key=lambda item: item[:2])}
+        return tuple(
+            TakeNote(
+                slate=slate,
+                take_number=number,
+                kind=remarks["shot"]["kind"],
+                folder=folder,
+                colour=remarks["judgement"]["colour"],
+                sentence=remarks["judgement"]["sentence"],
+                superseded=number < latest[slate],
+            )
+            for slate, number, folder, remarks in sorted(found, key=lambda item: item[:2])
+        )
+
+    def take(self, slate: str) -> Take:
+        """The latest take of a slate.
+
+        Raises:
+            TakeError: naming the slates that were recorded.
+        """
+        notes = self.takes()
+        for note in notes:
+            if note.slate == slate and not note.superseded:
+                return Take.open(note.folder)
+        known = ", ".join(sorted({note.slate for note in notes})) or "none"
+        raise TakeError(f"{self.folder}: no take of {slate!r}; recorded slates: {known}")
+
+    def next_number(self, slate: str) -> int:
+        """The take number that the next take of a slate will have."""
+        numbers = [0]
+        for folder in (self.folder / "takes").glob(f"{slate}_*"):
+            matched = re.fullmatch(re.escape(slate) + r"_(\d+)", folder.name)
+            if matched:
+                numbers.append(int(matched[1]))
+        return max(numbers) + 1
+
+
+def record_take(
+    session: Session,
+    shot: Shot,
+    array: DeviceArray,
+    settings: RecordSettings,
+    *,
+    progress: Progress = silent,
+) -> Take:
+    """Record one shot: triggers, frames to disk, ledger, manifest, verdict.
+
+    A take is whole or not there: an interrupted one leaves nothing. A retake never replaces an
+    older take; it gets the next number.
+
+    Args:
+        session: where the take will stand.
+        shot: what to record.
+        array: the devices and the line that triggers them.
+        settings: rate, exposure, pre-roll and post-roll.
+        progress: told after each frame.
+
+    Raises:
+        DeviceError: when a device cannot be prepared or does not deliver what it says.
+    """
+    number = session.next_number(shot.slate)
+    folder = session.folder / "takes" / f"{shot.slate}_{number:03d}"
+    layouts = {device.info.name: device.info.layout for device in array.devices}
+    total = shot.frames * len(layouts)
+    label = f"record {folder.name}"
+    with replacing(folder) as partial:
+        with TakeWriter(partial, layouts) as writer:
+            recording = record_frames(
+                array,
+                settings,
+                writer.write,
+                count=shot.frames,
+                start_ns=shot.start_ns,
+                told=lambda frames: progress(frames, total, label),
+            )
+            verdict = judge(recording.ledger, shot.hold)
+
+            def describe(devices: tuple[DeviceEntry, ...]) -> TakeManifest:
+                return TakeManifest(
+                    name=folder.name,
+                    kind="capture",
+                    devices=devices,
+                    frame_count=shot.frames,
+                    period_ns=recording.train.period_ns,
+                    start_ns=recording.train.start_ns,
+                    remarks=_remarks(shot, number, settings, recording, verdict),
+                )
+
+            writer.finish(describe)
+        write_ledger(partial / "ledger.csv", recording.ledger)
+    return Take.open(folder)
+
+
+def _remarks(
+    shot: Shot, number: int, settings: RecordSettings, recording: Recording, verdict: Judgement
+) -> dict[str, Any]:
+    return {
+        "shot": dataclasses.asdict(shot),
+        "take_number": number,
+        "settings": dataclasses.asdict(settings),
+        "judgement": dataclasses.asdict(verdict),
+        "verdicts": {str(kind): count for kind, count in recording.ledger.counts().items()},
+        "clocks": {
+            name: {
+                "offset_ns": model.offset_ns,
+                "drift_ppm": model.drift_ppm,
+                "jitter_ns": model.jitter_ns,
+            }
+            for name, model in recording.clocks.items()
+        },
+    }

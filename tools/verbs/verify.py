@@ -11,8 +11,10 @@ from typing import Any
 
 import tyro
 
+from capture.errors import WorkError
 from capture.progress import Progress
 from capture.take import Take
+from capture.verify import verify_take
 from tools.verbs.options import Options
 
 
@@ -25,5 +27,14 @@ class Arguments(Options):
 
 
 def run(arguments: Arguments, progress: Progress) -> dict[str, Any]:
-    """Verify and report."""
-    raise NotImplementedError(Take.open(arguments.take), progress)
+    """Verify and report.
+
+    Raises:
+        WorkError: listing everything that is not as it was written.
+    """
+    found = verify_take(Take.open(arguments.take), progress=progress)
+    if not found.sound:
+        lines = "\n".join(f"  - {problem}" for problem in found.problems)
+        raise WorkError(f"{arguments.take}: {len(found.problems)} problems\n{lines}")
+    verdicts = {str(verdict): count for verdict, count in found.verdicts.items()}
+    return {"take": str(arguments.take), "sound": True, "frames": found.frames, **verdicts}

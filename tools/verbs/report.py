@@ -1,0 +1,35 @@
+"""Write the HTML report of a take: one self-contained page.
+
+Example: likeness report takes/smile --rig rig --out report.html
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from capture.progress import Progress
+from tools.report import report_for_take
+from tools.verbs.options import Options
+
+
+@dataclass(frozen=True, kw_only=True)
+class Arguments(Options):
+    """Options of `likeness report`."""
+
+    take: tyro.conf.Positional[Path]
+    """The take."""
+    rig: Path | None = None
+    """The folder that `likeness rig` wrote."""
+    out: Path
+    """The page to write."""
+
+
+def run(arguments: Arguments, progress: Progress) -> dict[str, Any]:
+    """Write the page and report its size."""
+    report_for_take(arguments.take, arguments.out, rig=arguments.rig)
+    progress(1, 1, "report")
+    return {"page": str(arguments.out), "bytes": arguments.out.stat().st_size}

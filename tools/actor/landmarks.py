@@ -1,0 +1,104 @@
+"""Vertices with a meaning: dlib's 68 landmarks, and the skin that expressions hardly move."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from capture.arrays import Floats, Ints
+from tools.actor.identity import Identity
+from tools.actor.lattice import Lattice
+from tools.actor.sculpt import EYE_LEVEL, Sculpture, lip_heights, stomion_level
+
+_SIDE = 0.5
+
+
+def find_landmarks(lattice: Lattice, sculpture: Sculpture, who: Identity) -> Ints:
+    """Vertex ids (68,) of dlib's landmarks, in its order: from the actor's right to the left.
+
+    Args:
+        lattice: the topology.
+        sculpture: the neutral.
+        who: the proportions.
+    """
+    places = _jaw() + _brows(who) + _nose(who)
+    ids = [_nearest(lattice, sculpture.vertices, place) for place in places]
+    for eye, mirrored in ((lattice.eyes[0], False), (lattice.eyes[1], True)):
+        ids += _eye(sculpture.vertices, eye.corners, eye.upper, eye.lower, mirrored)
+    return np.array(ids + _mouth(lattice, sculpture, who), np.int64)
+
+
+def rigid_vertices(lattice: Lattice, vertices: Floats) -> Ints:
+    """Ids (n,) of the skin on bone: upper forehead, temples, bridge of the nose, behind the ears."""
+    x, y, z = vertices.T
+    forehead = (y > 46) & (z > 20)
+    temples = (np.abs(x) > 56) & (y > 18) & (z > -10)
+    bridge = (np.abs(x) < 4.5) & (y > 0) & (y < 14) & (z > 60)
+    crown = (y > 30) & (z <= 20)
+    return np.flatnonzero((lattice.ring == 0) & (forehead | temples | bridge | crown)).astype(np.int64)
+
+
+def _nearest(lattice: Lattice, vertices: Floats, place: tuple[float, float, float | None]) -> int:
+    """The outer vertex nearest to a place; without a depth, nearest in the frontal plane."""
+    x, y, z = place
+    away = np.hypot(vertices[:, 0] - x, vertices[:, 1] - y)
+    if z is not None:
+        away = np.hypot(away, vertices[:, 2] - z)
+    away[(lattice.ring > 0) | (vertices[:, 2] < -30)] = np.inf
+    return int(np.argmin(away))
+
+
+def _jaw() -> list[tuple[float, float, float | None]]:
+    left = [(71.0, 8.0, 5.0), (70.0, -11.0, 6.0), (68.0, -29.0, 8.0), (65.0, -47.0, 10.0),
+            (59.0, -65.0, 16.0), (50.0, -81.0, 28.0), (37.0, -93.0, 46.0), (19.0, -101.0, 68.0)]  # fmt: skip
+    right = [(-x, y, z) for x, y, z in left]
+    return [*right, (0.0, -104.0, 82.0), *left[::-1]]
+
+
+def _brows(who: Identity) -> list[tuple[float, float, float | None]]:
+    lift = who.brow_height
+    left = [(11.5, 22.5), (20.5, 26.0), (30.0, 28.5), (40.0, 28.5), (50.0, 23.0)]
+    outer_first = [(-x, y + lift, None) for x, y in left[::-1]]
+    return [*outer_first, *[(x, y + lift, None) for x, y in left]]
+
+
+def _nose(who: Identity) -> list[tuple[float, float, float | None]]:
+    drop = who.nose_length
+    bridge = [(0.0, 10.0, None), (0.0, -2.0, None), (0.0, -14.0, None), (0.0, -26.0 - drop, None)]
+    base = [(x, y - 0.6 * drop, None) for x, y in
+            ((-13.0, -33.5), (-6.5, -36.5), (0.0, -38.0), (6.5, -36.5), (13.0, -33.5))]  # fmt: skip
+    return [*bridge, *base]
+
+
+def _eye(vertices: Floats, corners: Ints, upper: Ints, lower: Ints, mirrored: bool) -> list[int]:
+    """Six ids in dlib's order: image-left corner, two above, image-right corner, two below."""
+    first, last = vertices[corners[0], 0], vertices[corners[1], 0]
+    span = last - first
+
+    def at(edge: Ints, share: float) -> int:
+        return int(edge[np.argmin(np.abs(vertices[edge, 0] - first - share * span))])
+
+    del mirrored
+    return [int(corners[0]), at(upper, 0.32), at(upper, 0.68), int(corners[1]), at(lower, 0.68), at(lower, 0.32)]
+
+
+def _mouth(lattice: Lattice, sculpture: Sculpture, who: Identity) -> list[int]:
+    vertices, slit = sculpture.vertices, lattice.mouth
+    half, level = who.mouth_half_width, stomion_level(who)
+    across = [-0.62, -0.24, 0.0, 0.24, 0.62]
+    upper, lower = lip_heights(np.array(across) * half, who)
+    ids = [int(slit.corners[0])]
+    above = [(s * half, level + h, None) for s, h in zip(across, upper, strict=True)]
+    below = [(s * half, level - h, None) for s, h in zip(across[::-1], lower[::-1], strict=True)]
+    ids += [_nearest(lattice, vertices, place) for place in above]
+    ids.append(int(slit.corners[1]))
+    ids += [_nearest(lattice, vertices, place) for place in below]
+    inner_x = np.array([-0.3, 0.0, 0.3]) * half
+
+    def on(edge: Ints, x: float) -> int:
+        return int(edge[np.argmin(np.abs(vertices[edge, 0] - x))])
+
+    ids.append(on(slit.upper, -0.88 * half))
+    ids += [on(slit.upper, x) for x in inner_x]
+    ids.append(on(slit.upper, 0.88 * half))
+    ids += [on(slit.lower, x) for x in inner_x[::-1]]
+    return ids

@@ -1,0 +1,306 @@
+"""Disparity of one rectified pair: a semi-global seed at low resolution, refined level by level."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from capture.arrays import Bools, Floats32, check_shape
+from capture.errors import SettingsError
+from recon.images import noise_sigma
+from recon.refine import Refined, refine_disparity
+
+
+class Reason(IntEnum):
+    """Why a pixel has no disparity."""
+
+    KEPT = 0
+    OUTSIDE = 1  # not on both recorded images
+    NO_SEED = 2  # no unique, left-right consistent match at low resolution
+    NO_TEXTURE = 3  # contrast not above the noise
+    LOW_CORRELATION = 4  # the windows do not look alike
+    UNCERTAIN = 5  # predicted deviation too large
+    LEFT_RIGHT = 6  # the right view's own match disagrees
+    FRAGMENT = 7  # part of a patch too small to trust
+
+
+@dataclass(frozen=True, kw_only=True)
+class DisparitySettings:
+    """How a pair is matched.
+
+    Attributes:
+        seed_px: the seed is matched at the first halving at which the crop is at most this long.
+        seed_block: block size of semi-global matching, odd, px.
+        radius: of the refinement window at full resolution, px.
+        iterations: refinement steps at full resolution; the levels below take the same number.
+        smoothness: weight of the smooth surface against a match known to 0.1 px.
+        ncc_min: least correlation of the windows.
+        contrast_min: least standard deviation in the window, in units of the noise.
+        sigma_max_px: largest predicted deviation of the disparity.
+        left_right_px: largest disagreement with the right view's own disparity.
+        fragment_px: patches smaller than this many pixels are dropped.
+    """
+
+    seed_px: int = 480
+    seed_block: int = 5
+    radius: int = 4
+    iterations: int = 8
+    smoothness: float = 0.5
+    ncc_min: float = 0.5
+    contrast_min: float = 1.5
+    sigma_max_px: float = 0.25
+    left_right_px: float = 1.0
+    fragment_px: int = 200
+
+    def __post_init__(self) -> None:
+        for name, low, high in (
+            ("seed_px", 64, 4096), ("seed_block", 1, 21), ("radius", 1, 20), ("iterations", 1, 200),
+            ("smoothness", 0.0, 1e3), ("ncc_min", 0.0, 0.99), ("contrast_min", 0.0, 100.0),
+            ("sigma_max_px", 1e-3, 10.0), ("left_right_px", 0.01, 100.0), ("fragment_px", 0, 10**7),
+        ):  # fmt: skip
+            value = getattr(self, name)
+            if not low <= value <= high:
+                raise SettingsError(f"{name}: expected {low}..{high}, found {value}")
+        if self.seed_block % 2 == 0:
+            raise SettingsError(f"seed_block: expected an odd number, found {self.seed_block}")
+
+
+@dataclass(frozen=True, eq=False)
+class DisparityMap:
+    """Disparity of the left view of a rectified pair.
+
+    Attributes:
+        disparity: (H, W) float32 px; NaN where rejected.
+        ncc: (H, W) float32 correlation of the windows; NaN where undefined.
+        sigma_px: (H, W) float32 predicted deviation, px; NaN where undefined.
+        reason: (H, W) uint8 of `Reason`; 0 where a disparity is kept.
+    """
+
+    disparity: Floats32
+    ncc: Floats32
+    sigma_px: Floats32
+    reason: NDArray[np.uint8]
+
+    @property
+    def coverage(self) -> float:
+        """Share of the crop that has a disparity."""
+        return float(np.isfinite(self.disparity).mean())
+
+
+def seed_disparity(
+    left: Floats32, right: Floats32, limits_px: tuple[float, float], block: int
+) -> Floats32:
+    """Disparity by semi-global matching over a given range, left-right checked, unique.
+
+    Args:
+        left: (H, W); NaN off the image.
+        right: (H, W); NaN off the image.
+        limits_px: least and greatest disparity.
+        block: block size, odd.
+
+    Returns:
+        (H, W) float32 px; NaN where there is no unique, consistent match.
+
+    References:
+        Hirschmueller, Stereo processing by semiglobal matching and mutual information, PAMI 2008;
+        OpenCV's StereoSGBM, MODE_HH (eight paths), on locally normalised 8-bit views.
+    """
+    check_shape(left=(left, "H W"), right=(right, "H W"))
+    low = int(np.floor(limits_px[0])) - 1
+    count = int(np.ceil((limits_px[1] + 1 - low) / 16.0)) * 16
+    pad_left, pad_right = max(low + count, 0), max(-low, 0)
+    views = [
+        cv2.copyMakeBorder(_flat_8bit(v), 0, 0, pad_left, pad_right, cv2.BORDER_CONSTANT, value=128)
+        for v in (left, right)
+    ]
+    matcher = cv2.StereoSGBM.create(
+        minDisparity=low,
+        numDisparities=count,
+        blockSize=block,
+        P1=8 * block * block,
+        P2=32 * block * block,
+        disp12MaxDiff=1,
+        preFilterCap=63,
+        uniquenessRatio=5,
+        mode=cv2.STEREO_SGBM_MODE_HH,
+    )
+    raw = matcher.compute(views[0], views[1])[:, pad_left : pad_left + left.shape[1]]
+    found = np.where(raw < low * 16, np.float32(np.nan), raw.astype(np.float32) / 16.0)
+    found[np.isnan(left)] = np.nan
+    return np.ascontiguousarray(found, dtype=np.float32)
+
+
+def match_pair(
+    left: Floats32, right: Floats32, limits_px: tuple[float, float], settings: DisparitySettings
+) -> DisparityMap:
+    """Disparity of a rectified pair at full resolution.
+
+    Args:
+        left: (H, W) reference view; NaN off the image.
+        right: (H, W) other view; NaN off the image.
+        limits_px: range of disparities searched by the seed.
+        settings: see there.
+
+    Returns:
+        Disparity, its confidence, and a reason for each pixel that has none.
+    """
+    levels = pyramid(left, right, settings.seed_px)
+    factor = 2 ** (len(levels) - 1)
+    seed = seed_disparity(
+        *levels[-1], (limits_px[0] / factor, limits_px[1] / factor), settings.seed_block
+    )
+    refined = _climb(levels, seed, settings)
+    mirrored = _right_view(levels, refined, settings)
+    return _judge(left, right, refined, mirrored, settings)
+
+
+def pyramid(left: Floats32, right: Floats32, size_px: int) -> list[tuple[Floats32, Floats32]]:
+    """Both views, halved until the longer side is at most `size_px`; full resolution first."""
+    levels = [(left, right)]
+    while max(levels[-1][0].shape) > size_px:
+        levels.append((_halve(levels[-1][0]), _halve(levels[-1][1])))
+    return levels
+
+
+def _climb(
+    levels: list[tuple[Floats32, Floats32]], seed: Floats32, settings: DisparitySettings
+) -> Refined:
+    """Refine the seed at its own level and at every finer one."""
+    refined: Refined | None = None
+    for index in range(len(levels) - 1, -1, -1):
+        view, other = levels[index]
+        start = _spread(seed, 3)
+        if refined is not None:
+            good = np.where(refined.ncc > 0.3, refined.disparity, np.float32(np.nan))
+            start = _double(_spread(good, 2), view.shape)
+        refined = refine_disparity(
+            view, other, start,
+            radius=settings.radius,
+            iterations=settings.iterations,
+            smoothness=settings.smoothness,
+        )  # fmt: skip
+    if refined is None:
+        raise ValueError("a pyramid has at least one level")
+    return refined
+
+
+def _right_view(
+    levels: list[tuple[Floats32, Floats32]], refined: Refined, settings: DisparitySettings
+) -> Floats32:
+    """The disparity seen by the right view: the nearest surface landing on each pixel."""
+    height, width = refined.disparity.shape
+    rows, columns = np.nonzero((refined.ncc > settings.ncc_min) & np.isfinite(refined.disparity))
+    values = refined.disparity[rows, columns]
+    target = np.rint(columns - values).astype(np.int64)
+    inside = (target >= 0) & (target < width)
+    nearest = np.full(height * width, -np.inf, np.float32)
+    np.maximum.at(nearest, rows[inside] * width + target[inside], values[inside])
+    return nearest.reshape(height, width)
+
+
+def _judge(
+    left: Floats32,
+    right: Floats32,
+    refined: Refined,
+    mirrored: Floats32,
+    settings: DisparitySettings,
+) -> DisparityMap:
+    """Give every pixel its reason, the first test that it fails."""
+    disparity = refined.disparity
+    reason = np.zeros(disparity.shape, np.uint8)
+
+    def fail(where: Bools, why: Reason) -> None:
+        reason[(reason == 0) & where] = why
+
+    noise = max(noise_sigma(np.nan_to_num(left)), 1e-5)
+    fail(np.isnan(left), Reason.OUTSIDE)
+    fail(np.isnan(disparity), Reason.NO_SEED)
+    fail(_local_deviation(left, settings.radius) < settings.contrast_min * noise, Reason.NO_TEXTURE)
+    fail(~(refined.ncc >= settings.ncc_min), Reason.LOW_CORRELATION)
+    fail(~(refined.sigma_px <= settings.sigma_max_px), Reason.UNCERTAIN)
+    columns = np.arange(disparity.shape[1], dtype=np.float32)[None] - disparity
+    target = np.clip(np.nan_to_num(np.rint(columns)), 0, disparity.shape[1] - 1).astype(np.int64)
+    seen = np.take_along_axis(mirrored, target, axis=1)
+    fail(seen - disparity > settings.left_right_px, Reason.LEFT_RIGHT)
+    kept = np.where(reason == 0, disparity, np.float32(np.nan))
+    fail(_fragments(kept, settings.fragment_px), Reason.FRAGMENT)
+    kept = np.where(reason == 0, disparity, np.float32(np.nan))
+    return DisparityMap(kept, refined.ncc, refined.sigma_px, reason)
+
+
+def _fragments(disparity: Floats32, size_px: int) -> Bools:
+    """Pixels of connected patches, cut at jumps of two pixels, that are smaller than `size_px`."""
+    known = np.isfinite(disparity)
+    if not known.any() or size_px == 0:
+        return np.zeros(disparity.shape, np.bool_)
+    low = float(np.nanmin(disparity))
+    fixed = np.where(known, np.clip((disparity - low) * 16 + 16, 0, 32000), 0).astype(np.int16)
+    cv2.filterSpeckles(fixed, 0, size_px, 32)
+    gone: Bools = known & (fixed == 0)
+    return gone
+
+
+def _flat_8bit(image: Floats32) -> NDArray[np.uint8]:
+    """Locally normalised 8-bit view: mean 128, a local deviation is 42 grey levels; NaN is 128."""
+    known = np.isfinite(image)
+    filled = np.where(known, image, np.float32(0.0))
+    share = cv2.GaussianBlur(known.astype(np.float32), (0, 0), 6.0) + np.float32(1e-6)
+    mean = cv2.GaussianBlur(filled, (0, 0), 6.0) / share
+    centred = np.where(known, image - mean, np.float32(0.0))
+    spread = np.sqrt(cv2.GaussianBlur(centred * centred, (0, 0), 6.0) / share)
+    floor = 3.0 * max(noise_sigma(filled), 1e-4)
+    flat = 128.0 + 42.0 * centred / np.sqrt(spread * spread + np.float32(floor * floor))
+    return np.clip(np.rint(flat), 0, 255).astype(np.uint8)
+
+
+def _local_deviation(image: Floats32, radius: int) -> Floats32:
+    """Standard deviation (H, W) in square windows, NaN pixels left out."""
+    known = np.isfinite(image)
+    level = np.float32(image[known].mean()) if known.any() else np.float32(0.0)
+    filled = np.where(known, image - level, np.float32(0.0))
+    size = (2 * radius + 1, 2 * radius + 1)
+    share = np.maximum(cv2.boxFilter(known.astype(np.float32), cv2.CV_32F, size), 1e-6)
+    mean = cv2.boxFilter(filled, cv2.CV_32F, size) / share
+    square = cv2.boxFilter(filled * filled, cv2.CV_32F, size) / share
+    deviation: Floats32 = np.sqrt(np.maximum(square - mean * mean, 0)).astype(np.float32)
+    return deviation
+
+
+def _halve(image: Floats32) -> Floats32:
+    """Half resolution by the mean of 2 x 2; NaN where any of the four is."""
+    height, width = image.shape[0] // 2 * 2, image.shape[1] // 2 * 2
+    even = image[:height, :width]
+    quarter = (even[0::2, 0::2] + even[0::2, 1::2] + even[1::2, 0::2] + even[1::2, 1::2]) * 0.25
+    return np.ascontiguousarray(quarter, dtype=np.float32)
+
+
+def _double(disparity: Floats32, shape: tuple[int, ...]) -> Floats32:
+    """Twice the resolution and twice the values; NaN where the nearest coarse pixel is."""
+    known = np.isfinite(disparity)
+    size = (2 * disparity.shape[1], 2 * disparity.shape[0])
+    filled = np.where(known, disparity, np.float32(0.0))
+    value = cv2.resize(filled, size, interpolation=cv2.INTER_LINEAR)
+    share = cv2.resize(known.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)
+    fine = np.where(share > 0.5, 2.0 * value / np.maximum(share, 1e-6), np.float32(np.nan))
+    out = np.full(shape, np.float32(np.nan))
+    height, width = min(shape[0], size[1]), min(shape[1], size[0])
+    out[:height, :width] = fine[:height, :width]
+    return out
+
+
+def _spread(disparity: Floats32, steps: int) -> Floats32:
+    """Continue the known disparities into the unknown by `steps` pixels, by local means."""
+    out = disparity.copy()
+    for _ in range(steps):
+        known = np.isfinite(out)
+        share = cv2.boxFilter(known.astype(np.float32), cv2.CV_32F, (3, 3), normalize=False)
+        total = cv2.boxFilter(
+            np.where(known, out, 0).astype(np.float32), cv2.CV_32F, (3, 3), normalize=False
+        )
+        grown = ~known & (share > 0.5)
+        out[grown] = (total / np.maximum(share, 1))[grown]
+    return out

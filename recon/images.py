@@ -1,0 +1,61 @@
+"""Images as the matchers want them: one channel, float32, linear 0..1, at full depth."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from capture.arrays import Floats32, Image
+from capture.errors import ShapeError
+
+# Equal weights for the two outer channels: RGB and BGR give the same grey.
+_OUTER, _MIDDLE = np.float32(0.25), np.float32(0.5)
+
+
+def mono(image: Image) -> Floats32:
+    """One linear grey channel in 0..1, no bit of depth thrown away.
+
+    Args:
+        image: (H, W), (H, W, 1), (H, W, 3) or (H, W, 4), uint8, uint16 or float already in 0..1. Of
+            colour, the middle channel (green) counts half and the outer two a quarter each, so that
+            RGB and BGR agree; a fourth channel (alpha) is ignored.
+
+    Returns:
+        (H, W) float32.
+
+    Raises:
+        ShapeError: naming the shape or the type found.
+    """
+    image = np.asarray(image)
+    if image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] not in (1, 3, 4)):
+        raise ShapeError(f"image: expected (H W), (H W 1), (H W 3) or (H W 4), found {image.shape}")
+    if image.dtype == np.uint8 or image.dtype == np.uint16:
+        scale = np.float32(1.0 / np.iinfo(image.dtype).max)
+    elif np.issubdtype(image.dtype, np.floating):
+        scale = np.float32(1.0)
+    else:
+        raise ShapeError(f"image: expected uint8, uint16 or float in 0..1, found {image.dtype}")
+    values = image.astype(np.float32)
+    if values.ndim == 3:
+        if values.shape[2] == 1:
+            values = values[:, :, 0]
+        else:
+            values = _OUTER * (values[:, :, 0] + values[:, :, 2]) + _MIDDLE * values[:, :, 1]
+    grey: Floats32 = np.ascontiguousarray(values * scale, dtype=np.float32)
+    return grey
+
+
+def noise_sigma(image: Floats32) -> float:
+    """Standard deviation of the noise of a grey image (H, W), robust to its texture.
+
+    The median over the image of the absolute response of a mask that is blind to constant and
+    linear shading; 0 for images narrower than three pixels.
+
+    References:
+        J. Immerkaer, Fast noise variance estimation, CVIU 64(2), 1996: the mask; the median in
+        place of the mean, because a face carries texture.
+    """
+    if min(image.shape) < 3:
+        return 0.0
+    wide = image[:, :-2] - 2.0 * image[:, 1:-1] + image[:, 2:]
+    response = wide[:-2] - 2.0 * wide[1:-1] + wide[2:]
+    return float(np.median(np.abs(response)) / (0.6745 * 6.0))

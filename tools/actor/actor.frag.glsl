@@ -39,16 +39,18 @@ Surface skin() {
     vec2 c = (above.yz - 0.5) * facing.y;
     float lip = vertex_paint.w;
     float dry = 1.0 - vertex_wet;
-    float wrinkle = texture(tile, place.yx * 1.6).w - 0.5;
-    float strand = texture(tile, vec2(place.x + 0.9 * abs(place.y), place.y) * 1.5).w - 0.5;
+    float wrinkle = 0.0, strand = 0.0;
+    if (lip > 0.0) wrinkle = texture(tile, place.yx * 1.6).w - 0.5;
+    if (vertex_paint.y > 0.0)
+        strand = texture(tile, vec2(place.x, place.y - 0.35 * abs(place.x)) * 1.5).w - 0.5;
     float factor = 2.0 * detail.x;
     factor = mix(factor, 1.0 + 0.5 * (factor - 1.0) + 0.55 * wrinkle, lip);
     Surface s;
     s.albedo = vertex_paint.x * mix(factor, 1.0, 0.6 * vertex_wet);
-    float brow = smoothstep(0.38, 0.72, vertex_paint.y + 0.75 * strand * step(0.01, vertex_paint.y));
-    s.albedo = mix(s.albedo, 0.085 + 0.12 * max(strand, 0.0), 0.93 * brow);
+    float brow = smoothstep(0.30, 0.95, vertex_paint.y + 0.8 * strand * step(0.01, vertex_paint.y));
+    s.albedo = mix(s.albedo, 0.10 + 0.10 * max(strand, 0.0), 0.88 * brow);
     float hair = smoothstep(0.25, 0.75, vertex_paint.z + 1.1 * (detail.w - 0.5) * vertex_paint.z);
-    s.albedo = mix(s.albedo, 0.13 + 0.22 * detail.w * detail.w, 0.9 * hair);
+    s.albedo = mix(s.albedo, 0.09 + 0.30 * detail.w * detail.w + 0.06 * (factor - 0.9), 0.88 * hair);
     s.tilt = vec3(a + vec2(c.x, 0.0) + vec2(0.0, b.y), b.x + c.y) * dry * (1.0 - 0.6 * lip);
     s.tilt.x += 0.25 * wrinkle * lip;
     s.specular = gloss * mix(0.055, 0.10, lip) * (1.0 - 0.6 * hair) * (1.0 - 0.8 * brow);
@@ -63,7 +65,7 @@ Surface eyeball() {
     float turn = atan(d.y, d.x);
     float fibre = texture(tile, vec2(r * 0.02, turn * 0.35)).w;
     float vein = texture(tile, rest_position.xy / tile_mm * 1.5).x;
-    float white = 0.66 - 0.018 * max(r - 6.0, 0.0) + 0.25 * (vein - 0.45);
+    float white = 0.52 - 0.018 * max(r - 6.0, 0.0) + 0.25 * (vein - 0.45);
     float iris = 0.20 + 0.30 * (fibre - 0.5) + 0.05 * smoothstep(2.0, 4.5, r);
     Surface s;
     s.albedo = mix(iris, 0.07, smoothstep(4.9, 5.8, r));
@@ -71,7 +73,7 @@ Surface eyeball() {
     s.albedo = mix(0.015, s.albedo, smoothstep(2.1, 2.5, r));
     s.albedo *= 1.0 - 0.5 * smoothstep(1.0, 7.5, rest_position.y);  // the shade of the upper lid
     s.tilt = vec3(0.0);
-    s.specular = 0.5;
+    s.specular = 0.22;
     s.sharpness = 260.0;
     return s;
 }

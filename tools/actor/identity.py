@@ -12,7 +12,7 @@ class Identity:
     """Proportions of one head; the defaults are the artist's generic head.
 
     Attributes:
-        seed: for everything random about this head; 0 for the generic one.
+        seed: for everything random about this head; -1 for the generic one.
         head_width: scale of the cranium's breadth.
         face_length: scale of the height below the eyes.
         cheek_width: outward push of the cheekbones, mm.
@@ -37,7 +37,7 @@ class Identity:
         lumps: amplitude of the smooth irregularity of the whole head, mm.
     """
 
-    seed: int = 0
+    seed: int = -1
     head_width: float = 1.0
     face_length: float = 1.0
     cheek_width: float = 0.0
@@ -45,7 +45,7 @@ class Identity:
     chin_forward: float = 0.0
     brow_ridge: float = 2.0
     eye_spacing: float = 0.0
-    eye_opening: float = 10.2
+    eye_opening: float = 9.8
     eye_tilt: float = 1.5
     nose_length: float = 0.0
     nose_height: float = 22.0
@@ -60,6 +60,11 @@ class Identity:
     freckles: float = 0.5
     gloss: float = 1.0
     lumps: float = 0.0
+
+    @property
+    def generic(self) -> bool:
+        """Whether this is the artist's head rather than an actor's."""
+        return self.seed < 0
 
 
 _SPREAD = {

@@ -65,13 +65,13 @@ def teeth(stomion: Floats, *, upper: bool) -> tuple[Mesh, Floats]:
     """A row of teeth on its arch: mesh in head space, and (arc length, height, 0) of each vertex."""
     turn = np.linspace(-1.15, 1.15, _TEETH_COLUMNS)
     breadth, depth = (27.0, 34.0) if upper else (25.5, 33.0)
-    front = stomion[2] - (11.5 if upper else 14.0)
+    front = stomion[2] - (10.5 if upper else 13.5)
     x = breadth * np.sin(turn)
     z = front - depth * (1.0 - np.cos(turn)) ** 0.9
     arc = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(z)))])
     arc -= arc.mean()
     up = 1.0 if upper else -1.0
-    edge = stomion[1] - (1.5 if upper else 2.2)
+    edge = stomion[1] - (2.8 if upper else 1.6)
     heights = np.array([11.0, 8.5, 5.0, 2.0, 0.3, 0.0, 0.6, 6.0])
     inward = np.array([1.2, 0.0, 0.0, 0.2, 0.7, 1.6, 2.6, 5.0])
     gap = 0.5 * (1.0 - np.abs(np.cos(np.pi * arc / 7.6)) ** 0.35)

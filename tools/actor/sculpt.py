@@ -157,7 +157,7 @@ def _features(points: Floats, who: Identity) -> Floats:
     push -= 2.5 * bump((wide - 42) / 13, (y + 52) / 17)
     push += _nose(x, y, who)
     push += _lips(x, y, who)
-    push -= 2.2 * bump(x / 20, (y + 73) / 5.0)
+    push -= 1.6 * bump(x / 20, (y + 73) / 5.0)
     push += 3.6 * bump(x / 15, (y + 90) / 9)
     fold = 17.0 + 14.0 * np.clip((-30.0 - y) / 28.0, 0.0, 1.3)
     push -= 1.3 * bump((wide - fold) / 3.2, (y + 44) / 13)
@@ -194,9 +194,10 @@ def _lips(x: Floats, y: Floats, who: Identity) -> Floats:
     level = y - stomion_level(who)
     upper, lower = lip_heights(x, who)
     share = np.where(level > 0, level / upper, -level / lower)
-    swell = np.where(level > 0, 0.42 * upper, 0.44 * lower) * np.clip(3 - np.abs(x) / 10, 0, 1)
+    across = np.clip(1.0 - (x / (half + 2.0)) ** 2, 0.0, 1.0) ** 0.7
+    swell = np.where(level > 0, 0.40 * upper, 0.40 * lower) * across
     full = np.sqrt(np.clip(1.0 - ((share - 0.45) / 1.15) ** 2, 0.0, 1.0)) * smooth_step(1.6, 0.9, share)
-    push = 3.4 * bump(x / 32, (level - 2) / 17)
+    push = 2.6 * bump(x / 30, (level - 2) / 17)
     push = push + swell * full
     push += 0.6 * bump(x / 4, (level - 3.4) / 3.0)
     push -= 1.2 * bump(level / 1.5) * smooth_step(half + 4.0, half - 2.0, np.abs(x))
@@ -258,7 +259,7 @@ def _eye(points: Floats, lattice: Lattice, slit: Slit, who: Identity) -> tuple[F
     rise = rise * np.exp(-((np.abs(offset) / 4.5) ** 1.5))
     tilt = who.eye_tilt * np.clip(place * side, -1.0, 1.6) * bump(place / 1.6, offset / 7.0)
     out[:, 1] += np.where(near, rise + tilt, 0.0)
-    ball = np.array([centre_x, EYE_LEVEL + 0.6, 64.8])
+    ball = np.array([centre_x, EYE_LEVEL + 1.6, 64.8])
     x, y, z = out.T
     apart = np.hypot(x - ball[0], (y - ball[1]))
     cap = np.sqrt(np.maximum(LID_RADIUS**2 - apart**2, 0.0))

@@ -54,7 +54,7 @@ def paint_skin(lattice: Lattice, sculpture: Sculpture, normals: Floats, who: Ide
     albedo = who.skin * (1.0 + who.blotches * blotches)
     albedo *= 1.0 - 0.10 * bump((wide - 34) / 14, (y + 22) / 12)  # the red of the cheeks
     albedo *= 1.0 - 0.12 * bump(x / 11, (y + 27) / 8)
-    albedo *= 1.0 - 0.22 * bump((wide - 30) / 15, (y - EYE_LEVEL + 9) / 4) * (y < EYE_LEVEL)
+    albedo *= 1.0 - 0.10 * bump((wide - 30) / 15, (y - EYE_LEVEL + 9) / 4) * (y < EYE_LEVEL)
     albedo *= _hollows(lattice, points, normals)
     nostril = bump((wide - 6.2) / 3.4, (y + who.nose_length + 34.0) / 2.2) * (z > 80) * (normals[:, 1] < 0.1)
     albedo *= 1.0 - 0.75 * nostril
@@ -72,7 +72,7 @@ def paint_skin(lattice: Lattice, sculpture: Sculpture, normals: Floats, who: Ide
         albedo[eye.upper] = who.skin * 0.3
         albedo[eye.lower] = who.skin * 0.62
         albedo[eye.corners] = who.skin * 0.5
-    hair = smooth_step(0.35, 0.65, _hairline(points) + 0.03 * wave(points, who.seed + 8, 12.0))
+    hair = smooth_step(0.2, 0.9, _hairline(points) + 0.10 * wave(points, who.seed + 8, 16.0))
     return Paint(albedo, _brows(points, who), hair * outer, lip, wet)
 
 
@@ -91,7 +91,7 @@ def _hollows(lattice: Lattice, points: Floats, normals: Floats) -> Floats:
         for _ in range(steps):
             smooth = mean @ smooth
         rise = ((smooth - points) * normals).sum(axis=1)
-        shade *= 1.0 - 0.5 * np.clip(rise / depth, 0.0, 1.0)
+        shade *= 1.0 - 0.26 * np.tanh(np.clip(rise, 0.0, None) / depth)
     result: Floats = np.where(lattice.ring == 0, shade, 1.0)
     return result
 
@@ -125,7 +125,8 @@ def _hairline(points: Floats) -> Floats:
     line = 66.0 - 2.0 * np.exp(-((np.abs(x) - 30.0) ** 2) / 200.0) - rear**1.4 * 120.0
     line = np.where(z < -30, -55.0, line)
     temple = 22.0 * bump((z - 12.0) / 12.0)
-    grown: Floats = 0.5 + (y - line + temple * (y < 40)) / 14.0
+    ear = bump((np.abs(x) - 80.0) / 9.0) * bump((z + 18.0) / 20.0, (y + 8.0) / 34.0)
+    grown: Floats = 0.5 + (y - line + temple * (y < 40)) / 22.0 - 2.0 * ear
     return grown
 
 
@@ -167,7 +168,7 @@ def make_tile(seed: int, freckles: float) -> Floats32:
     pores = dots(0.55, 0.26) + dots(0.9, 0.16)
     spots = np.clip(dots(0.035, 0.62), 0.0, 1.2)
     mottle = 0.55 * band(1.1) + 0.6 * band(2.2) + 0.55 * band(5.0)
-    albedo = 0.5 + 0.052 * mottle - 0.16 * np.clip(pores, 0, 1.6) - 0.22 * freckles * spots
+    albedo = 0.5 + 0.052 * mottle - 0.12 * np.clip(pores, 0, 1.6) - 0.15 * freckles * spots
     height = 0.035 * band(0.6) + 0.05 * band(1.4) - 0.10 * pores
     step = TILE_MM / _TILE
     slope_x = (np.roll(height, -1, 1) - np.roll(height, 1, 1)) / (2.0 * step)

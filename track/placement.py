@@ -17,6 +17,7 @@ from track.visibility import around, count_views
 _NORMAL_MM = 30.0  # a unit of normal difference in the search of the placement
 _SCALES = (0.7, 1.4)
 _BORDER_MM = 6.0
+_ROUGH, _FINE = 2500, 40000  # vertices in the search trees
 _SHIFTS_MM = (-45.0, 0.0, 45.0)
 _TILTS = (-0.45, 0.0, 0.45)  # rad of yaw and pitch tried around the best
 
@@ -58,8 +59,13 @@ class Placer:
         """Take (vertices, triangles) of the template and of the scan, mm."""
         self._view = view
         outer = count_views(*template, around(template[0])) > 0
-        self._template, self._template_at = _searchable(*template, outer)
-        self._scan, self._scan_at = _searchable(*scan, np.ones(len(scan[0]), dtype=np.bool_))
+        every = np.ones(len(scan[0]), dtype=np.bool_)
+        self._surfaces = {
+            size: (_searchable(*template, outer, size), _searchable(*scan, every, size))
+            for size in (_ROUGH, _FINE)
+        }
+        self._template_at = _oriented(*template, outer)
+        self._scan_at = _oriented(*scan, every)
 
     def search(self) -> Placement:
         """Try the given place and all upright and turned ones; return the best, refined.
@@ -68,7 +74,8 @@ class Placer:
             SolveError: when no start overlaps the scan.
         """
         starts = [Similarity(rotation=np.eye(3), translation=np.zeros(3)), *self._starts()]
-        rough = self._best([self.refine(start, 4, 250) for start in starts], 6)
+        first = self._best([self.refine(start, 0, 150) for start in starts], 24)
+        rough = self._best([self.refine(p.world_from_template, 4, 250) for p in first], 6)
         tilted = [self._tilt(rough[0], yaw, pitch) for yaw, pitch in product(_TILTS, _TILTS)]
         rough += [self.refine(start, 6, 250) for start in tilted]
         fine = self._best([self.refine(p.world_from_template, 10, 600) for p in rough], 2)
@@ -95,13 +102,14 @@ class Placer:
 
     def _pairs(self, motion: Similarity, count: int) -> tuple[Floats, Floats, Floats, float]:
         """Matched template points, scan points and normals, world mm; and the score."""
+        template, scan = self._surfaces[_ROUGH if count < 2000 else _FINE]
         turn = motion.rotation
-        points, normals = self._thin(self._template_at, count)
+        points, normals = (part[:count] for part in self._template_at)
         there = motion.apply(points)
-        out = self._scan.match(there, normals @ turn.T)
-        scan_points, scan_normals = self._thin(self._scan_at, count)
+        out = scan.match(there, normals @ turn.T)
+        scan_points, scan_normals = (part[:count] for part in self._scan_at)
         inside = (scan_points - motion.translation) @ turn / motion.scale
-        back = self._template.match(inside, scan_normals @ turn)
+        back = template.match(inside, scan_normals @ turn)
         share_out, keep_out, cost_out = _judge(out, 1.0)
         share_back, keep_back, cost_back = _judge(back, motion.scale)
         source = np.concatenate([there[keep_out], motion.apply(back.points[keep_back])])
@@ -110,11 +118,6 @@ class Placer:
         overlap = max(share_out, share_back)
         score = float(np.concatenate([cost_out, cost_back]).mean()) if len(source) else np.inf
         return source, target, normal, score / max(overlap, 1e-3)
-
-    def _thin(self, surface: tuple[Floats, Floats], count: int) -> tuple[Floats, Floats]:
-        points, normals = surface
-        chosen = np.linspace(0, len(points) - 1, min(count, len(points))).astype(np.int64)
-        return points[chosen], normals[chosen]
 
     def _best(self, placements: list[Placement], count: int) -> list[Placement]:
         found = [placement for placement in placements if np.isfinite(placement.score_mm)]
@@ -165,16 +168,20 @@ def place_by_landmarks(template: Floats, positions: Floats) -> Similarity:
     return fit_similarity(template, positions, with_scale=True)
 
 
-def _searchable(
-    vertices: Floats, triangles: Ints32, usable: Bools
-) -> tuple[MatchSurface, tuple[Floats, Floats]]:
-    """A surface to search, and its usable points and normals in a shuffled, fixed order."""
-    normals = vertex_normals(vertices, triangles)
-    usable = usable & np.isfinite(normals[:, 0])
+def _searchable(vertices: Floats, triangles: Ints32, usable: Bools, tree_size: int) -> MatchSurface:
+    """A surface whose points near an open border are not to be used."""
     inner = usable & ~near_border(vertices, triangles, _BORDER_MM)
-    surface = MatchSurface(vertices, triangles, normal_mm=_NORMAL_MM, usable=inner)
-    order = np.random.default_rng(0).permutation(np.flatnonzero(usable))
-    return surface, (vertices[order], normals[order])
+    return MatchSurface(
+        vertices, triangles, normal_mm=_NORMAL_MM, usable=inner, tree_size=tree_size
+    )
+
+
+def _oriented(vertices: Floats, triangles: Ints32, usable: Bools) -> tuple[Floats, Floats]:
+    """Usable points and their normals in a shuffled, fixed order."""
+    normals = vertex_normals(vertices, triangles)
+    kept = np.flatnonzero(usable & np.isfinite(normals[:, 0]))
+    order = np.random.default_rng(0).permutation(kept)
+    return vertices[order], normals[order]
 
 
 def _judge(matches: Matches, scale: float) -> tuple[float, Bools, Floats]:

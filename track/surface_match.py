@@ -40,7 +40,13 @@ class MatchSurface:
     """A triangle mesh that can be asked for its closest points in position and normal."""
 
     def __init__(
-        self, vertices: Floats, triangles: Ints32, *, normal_mm: float, usable: Bools | None = None
+        self,
+        vertices: Floats,
+        triangles: Ints32,
+        *,
+        normal_mm: float,
+        usable: Bools | None = None,
+        tree_size: int | None = None,
     ) -> None:
         """Build the search tree.
 
@@ -49,6 +55,7 @@ class MatchSurface:
             triangles: (T, 3).
             normal_mm: how many mm a unit of normal difference counts in the search.
             usable: (V,) vertices that may be met and used; None for all.
+            tree_size: search among about this many vertices only: coarser and faster.
         """
         check_shape(vertices=(vertices, "V 3"), triangles=(triangles, "T 3"))
         normals = vertex_normals(vertices, triangles)
@@ -60,6 +67,9 @@ class MatchSurface:
         self._normal_mm = normal_mm
         self._first, self._around = _incident(len(vertices), self._triangles)
         self._alive = np.flatnonzero(~dead)
+        if tree_size is not None and tree_size < len(self._alive):
+            kept = np.random.default_rng(0).choice(len(self._alive), tree_size, replace=False)
+            self._alive = self._alive[np.sort(kept)]
         self._tree = cKDTree(self._features(vertices, self._normals)[self._alive])
 
     def match(self, points: Floats, normals: Floats) -> Matches:
@@ -128,50 +138,61 @@ def _closest_around(
     for n in range(len(points)):
         best = np.inf
         for slot in range(first[nearest[n]], first[nearest[n] + 1]):
-            corner = triangles[around[slot]]
-            a, b, c = vertices[corner[0]], vertices[corner[1]], vertices[corner[2]]
-            w = _on_triangle(points[n], a, b, c)
-            gap = points[n] - (w[0] * a + w[1] * b + w[2] * c)
-            square = gap[0] * gap[0] + gap[1] * gap[1] + gap[2] * gap[2]
+            a, b, c = triangles[around[slot]]
+            d1, d2, bb, bc, cc = 0.0, 0.0, 0.0, 0.0, 0.0
+            for axis in range(3):
+                origin = vertices[a, axis]
+                ab, ac = vertices[b, axis] - origin, vertices[c, axis] - origin
+                ap = points[n, axis] - origin
+                d1 += ab * ap
+                d2 += ac * ap
+                bb += ab * ab
+                bc += ab * ac
+                cc += ac * ac
+            v, w = _on_triangle(d1, d2, bb, bc, cc)
+            square = 0.0
+            for axis in range(3):
+                met = (1.0 - v - w) * vertices[a, axis] + v * vertices[b, axis]
+                square += (points[n, axis] - met - w * vertices[c, axis]) ** 2
             if square < best:
                 best = square
                 face[n] = around[slot]
-                weights[n, 0], weights[n, 1], weights[n, 2] = w[0], w[1], w[2]
+                weights[n, 0], weights[n, 1], weights[n, 2] = 1.0 - v - w, v, w
     return face, weights
 
 
 @numba.njit(cache=True)
-def _on_triangle(p: Floats, a: Floats, b: Floats, c: Floats) -> tuple[float, float, float]:
-    """Barycentric weights of the point of triangle abc closest to p.
+def _on_triangle(d1: float, d2: float, bb: float, bc: float, cc: float) -> tuple[float, float]:
+    """Weights of b and c at the point of triangle abc closest to p.
+
+    Args:
+        d1: (b - a) . (p - a), and d2 (c - a) . (p - a).
+        d2: see d1.
+        bb: (b - a) . (b - a), bc (b - a) . (c - a), cc (c - a) . (c - a).
+        bc: see bb.
+        cc: see bb.
 
     References:
         Ericson 2005, "Real-time collision detection", Sec. 5.1.5.
     """
-    ab, ac, ap = b - a, c - a, p - a
-    d1, d2 = (ab * ap).sum(), (ac * ap).sum()
+    d3, d4, d5, d6 = d1 - bb, d2 - bc, d1 - bc, d2 - cc
     if d1 <= 0.0 and d2 <= 0.0:
-        return 1.0, 0.0, 0.0
-    bp = p - b
-    d3, d4 = (ab * bp).sum(), (ac * bp).sum()
+        return 0.0, 0.0
     if d3 >= 0.0 and d4 <= d3:
-        return 0.0, 1.0, 0.0
+        return 1.0, 0.0
+    if d6 >= 0.0 and d5 <= d6:
+        return 0.0, 1.0
     vc = d1 * d4 - d3 * d2
     if vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
-        v = d1 / (d1 - d3)
-        return 1.0 - v, v, 0.0
-    cp = p - c
-    d5, d6 = (ab * cp).sum(), (ac * cp).sum()
-    if d6 >= 0.0 and d5 <= d6:
-        return 0.0, 0.0, 1.0
+        return d1 / (d1 - d3), 0.0
     vb = d5 * d2 - d1 * d6
     if vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
-        w = d2 / (d2 - d6)
-        return 1.0 - w, 0.0, w
+        return 0.0, d2 / (d2 - d6)
     va = d3 * d6 - d5 * d4
     if va <= 0.0 and d4 - d3 >= 0.0 and d5 - d6 >= 0.0:
         w = (d4 - d3) / ((d4 - d3) + (d5 - d6))
-        return 0.0, 1.0 - w, w
+        return 1.0 - w, w
     total = va + vb + vc
     if total <= 0.0:
-        return 1.0, 0.0, 0.0
-    return va / total, vb / total, vc / total
+        return 0.0, 0.0
+    return vb / total, vc / total

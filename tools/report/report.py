@@ -1,0 +1,117 @@
+"""Reports as pages: of a session, of one take, of a calibration, of scans."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from capture.camera import CameraArray
+from capture.progress import Progress, silent
+from tools.report.calibration import calibration_section
+from tools.report.inputs import ReportInputs, TakeInputs
+from tools.report.overview import (
+    capture_section,
+    layout_section,
+    numbers_section,
+    timing_section,
+)
+from tools.report.page import Section, write_page
+from tools.report.quality import quality_section
+from tools.report.shapes import rig_section
+from tools.report.surfaces import overlay_section, scan_section
+from tools.report.svg import escape
+
+_Part = Callable[[ReportInputs], list[Section]]
+_PARTS: tuple[_Part, ...] = (
+    timing_section,
+    layout_section,
+    capture_section,
+    calibration_section,
+    scan_section,
+    overlay_section,
+    quality_section,
+    rig_section,
+    numbers_section,
+)
+
+
+def write_report(inputs: ReportInputs, out: Path, *, progress: Progress = silent) -> Path:
+    """Write one self-contained HTML page of everything that `inputs` holds.
+
+    Args:
+        inputs: what to report on; what it lacks is left out.
+        out: the file.
+        progress: told after each section.
+
+    Returns:
+        `out`.
+
+    Raises:
+        InputError: naming a take, rig or report that is there and damaged.
+    """
+    return _write(inputs, out, _PARTS, progress)
+
+
+def report_for_take(
+    take: Path, out: Path, *, rig: Path | None = None, progress: Progress = silent
+) -> Path:
+    """Report on one take: whatever its stages have made by now.
+
+    Args:
+        take: the take's folder.
+        out: the file.
+        rig: the folder that `likeness rig` wrote, or None.
+        progress: told after each section.
+    """
+    item = TakeInputs(folder=Path(take))
+    cameras = item.folder / "cameras.json"
+    inputs = ReportInputs(
+        title=item.take.name,
+        takes=(item,),
+        calibration=cameras if cameras.is_file() else None,
+        rig=rig,
+    )
+    return write_report(inputs, out, progress=progress)
+
+
+def write_calibration_page(cameras: CameraArray, report: Mapping[str, Any], out: Path) -> Path:
+    """Write the page of a calibration: layout, residuals, coverage, warnings.
+
+    Args:
+        cameras: the calibrated array.
+        report: what the calibration says of itself.
+        out: the file.
+    """
+    inputs = ReportInputs(title="Calibration", cameras=cameras, told=report)
+    return _write(inputs, out, (calibration_section, layout_section, numbers_section), silent)
+
+
+def write_scan_page(take: Path, out: Path) -> Path:
+    """Write the page of a take's scans: pictures, confidence, agreement between pairs."""
+    item = TakeInputs(folder=Path(take))
+    inputs = ReportInputs(title=f"Scans of {item.take.name}", takes=(item,))
+    return _write(inputs, out, (scan_section, layout_section, numbers_section), silent)
+
+
+def _write(inputs: ReportInputs, out: Path, parts: tuple[_Part, ...], progress: Progress) -> Path:
+    sections = []
+    for done, part in enumerate(parts, start=1):
+        sections += part(inputs)
+        progress(done, len(parts), "report")
+    write_page(inputs.title, _lead(inputs), sections, Path(out))
+    return Path(out)
+
+
+def _lead(inputs: ReportInputs) -> str:
+    pieces = []
+    if inputs.takes:
+        names = ", ".join(item.take.name for item in inputs.takes)
+        frames = sum(len(item.take.frames) for item in inputs.takes)
+        count = "1 take" if len(inputs.takes) == 1 else f"{len(inputs.takes)} takes"
+        pieces.append(f"{count} ({names}), {frames} frames")
+    if inputs.array is not None:
+        pieces.append(f"{len(inputs.array)} cameras")
+    if inputs.face_rig is not None:
+        pieces.append(f"a rig of {len(inputs.face_rig.names)} shapes")
+    return f'<p class="lead">{escape(", ".join(pieces))}</p>' if pieces else ""

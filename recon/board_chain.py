@@ -127,8 +127,8 @@ def _linear_focal(observations: BoardObservations, corners: Floats, device: int)
     for rows in _device_views(observations, device):
         xy = corners[observations.corner[rows], :2]
         found, _ = cv2.findHomography(xy, observations.pixels[rows] - centre, 0)
-        homography: Floats | None = found  # OpenCV gives None for degenerate corners
-        if homography is None:
+        homography = np.asarray(found, dtype=np.float64)  # OpenCV's None becomes NaN
+        if not np.isfinite(homography).all():
             continue
         first, second = homography[:, 0], homography[:, 1]
         scale = first[:2] @ first[:2] + second[:2] @ second[:2]

@@ -162,7 +162,7 @@ def _held_out(solution: ArraySolution) -> dict[str, Any]:
 
 
 def _vectors(solution: ArraySolution, index: int) -> list[list[float]]:
-    """Evenly picked residuals [x, y, dx, dy] of one device, px: observed place, predicted minus it."""
+    """Residuals [x, y, dx, dy] of one device, px: the place seen, predicted minus it."""
     rows = np.flatnonzero((solution.observations.device == index) & solution.kept)
     if len(rows) > _MOST_VECTORS:
         rows = rows[np.linspace(0, len(rows) - 1, _MOST_VECTORS).round().astype(int)]
@@ -219,8 +219,8 @@ def _device_warnings(report: Mapping[str, Any]) -> list[str]:
             )
         if device["covered"] < _THIN_COVERAGE:
             out.append(
-                f"{name}: corners cover {100 * device['covered']:.0f} % of its image; hold the board "
-                "into its corners too."
+                f"{name}: corners cover {100 * device['covered']:.0f} % of its image; "
+                "hold the board into its corners too."
             )
         loose = (device["fx_sigma_px"] or np.inf) / device["fx_px"]
         if not loose <= _LOOSE_FOCAL:

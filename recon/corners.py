@@ -136,7 +136,7 @@ def detect_corners(image: Image, board: Board, limits: CornerLimits | None = Non
 
 
 def edge_spread(grey: Floats32, pixels: Floats, flat: Floats, square_mm: float) -> float:
-    """Width of the board's edges at its corners: defocus and motion blur along the worse board axis.
+    """Width of the board's edges at its corners: defocus and motion blur, along the worse axis.
 
     Each corner is crossed by two edges. Along either board axis the steepest slope of brightness of
     an edge of contrast D and Gaussian spread s is D / (s sqrt(2 pi)).

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
-from capture.arrays import Floats
+from capture.arrays import Floats, Image
 from capture.camera import Camera, CameraArray
 from capture.pose import Pose
 from recon.array_state import ArrayState
 from recon.board import Board
 from recon.observations import BoardObservations
+
+_PRINT = 8.0  # pixels of the drawn pattern a millimetre
+_FINE = 3  # samples a pixel, along each axis
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,6 +146,56 @@ def observe(scene: BoardScene, truth: ArrayState) -> BoardObservations:
         device=table[:, 0].astype(np.int64), pose=table[:, 1].astype(np.int64),
         corner=table[:, 2].astype(np.int64), pixels=table[:, 3:],
     )  # fmt: skip
+
+
+def render_board(
+    camera: Camera, world_from_board: Pose, board: Board, blur_px: float = 0.7, seed: int = 0
+) -> Image:
+    """An 8-bit image of a flat board through the camera's lens, with blur and 2 DN of noise.
+
+    The printed pattern is warped by `cv2.remap`, three samples a pixel along each axis.
+
+    Args:
+        camera: which sees it.
+        world_from_board: where the board is, mm.
+        board: its pattern.
+        blur_px: standard deviation of the blur.
+        seed: of the noise.
+    """
+    size = (board.squares_x * board.square_mm, board.squares_y * board.square_mm)
+    print_px = (int(size[0] * _PRINT), int(size[1] * _PRINT))
+    print_mm = np.array(size) / print_px
+    pattern = board.pattern().generateImage(print_px, marginSize=0)
+    pose = camera.camera_from_world @ world_from_board
+    plane = np.column_stack([pose.rotation[:, :2], pose.translation])
+    to_print = np.array([[1 / print_mm[0], 0, -0.5], [0, 1 / print_mm[1], -0.5], [0, 0, 1.0]])
+    ideal = _ideal_grid(camera)
+    maps = cv2.perspectiveTransform(ideal, to_print @ np.linalg.inv(plane)).astype(np.float32)
+    fine = cv2.remap(
+        pattern, maps[:, :, 0], maps[:, :, 1], cv2.INTER_LINEAR, borderValue=255.0
+    )  # outside the print the paper is white
+    image = cv2.resize(fine, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+    blurred = cv2.GaussianBlur(0.75 * image.astype(np.float64) + 20.0, (0, 0), blur_px)
+    noisy = blurred + np.random.default_rng([seed, 5]).normal(0.0, 2.0, blurred.shape)
+    seen: Image = np.clip(np.round(noisy), 0, 255).astype(np.uint8)
+    return seen
+
+
+def _ideal_grid(camera: Camera) -> Floats:
+    """Ideal places (H', W', 2) of samples finer than pixels, linear between every fourth pixel."""
+    columns = np.arange(-4.0, camera.width + 8.0, 4.0)
+    rows = np.arange(-4.0, camera.height + 8.0, 4.0)
+    grid = np.stack(np.meshgrid(columns, rows), axis=-1)
+    coarse = camera.undistort(grid.reshape(-1, 2)).reshape(grid.shape)
+    x = (np.arange(camera.width * _FINE) + 0.5) / _FINE - 0.5
+    y = (np.arange(camera.height * _FINE) + 0.5) / _FINE - 0.5
+    u, v = np.meshgrid((x + 4.0) / 4.0, (y + 4.0) / 4.0)
+    i, j = u.astype(np.int64), v.astype(np.int64)
+    a, b = (u - i)[:, :, None], (v - j)[:, :, None]
+    top = (1 - a) * coarse[j, i] + a * coarse[j, i + 1]
+    low = (1 - a) * coarse[j + 1, i] + a * coarse[j + 1, i + 1]
+    fine: Floats = (1 - b) * top + b * low
+    return fine
 
 
 def triangulation_error(truth: CameraArray, found: CameraArray, seed: int = 0) -> Floats:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
+from typing import Any
 
 import cv2
 import moderngl
@@ -11,7 +11,8 @@ import numpy as np
 
 from capture.arrays import Floats, Floats32
 from capture.camera import Camera
-from capture.errors import DeviceError, SettingsError
+from capture.errors import SettingsError
+from track.gpu_context import gl_context
 
 _NEAR_MM, _FAR_MM = 40.0, 4000.0
 
@@ -41,15 +42,15 @@ class Canvas:
 
     Raises:
         SettingsError: when `supersample` is not 1..4.
-        DeviceError: when no OpenGL context can be made.
+        WorkError: when no OpenGL context can be made.
     """
 
     def __init__(self, supersample: int = 2) -> None:
         if not 1 <= supersample <= 4:
             raise SettingsError(f"supersample: must lie in 1..4, found {supersample}")
         self.supersample = supersample
-        self.context = _context()
-        self._targets: dict[tuple[int, int], moderngl.Framebuffer] = {}
+        self.context: Any = gl_context()
+        self._targets: dict[tuple[int, int], Any] = {}
         self._lenses: dict[tuple[float, ...], tuple[Floats, Floats32, Floats32]] = {}
 
     def view(self, camera: Camera) -> View:
@@ -87,7 +88,7 @@ class Canvas:
         """Clear the target for a view and make it the place that is drawn to."""
         if view.size not in self._targets:
             self._targets[view.size] = self.context.framebuffer(
-                [self.context.texture(view.size, 1, dtype="f4")],
+                [self.context.texture(view.size, 1, dtype="f2")],
                 self.context.depth_renderbuffer(view.size),
             )
         self._targets[view.size].use()
@@ -96,9 +97,9 @@ class Canvas:
 
     def pinhole(self, view: View) -> Floats32:
         """What was drawn, supersampled and without the lens: float32, first row at the top."""
-        raw = self._targets[view.size].read(components=1, dtype="f4")
+        raw = self._targets[view.size].read(components=1, dtype="f2")
         width, height = view.size
-        return np.frombuffer(raw, np.float32).reshape(height, width)[::-1]
+        return np.frombuffer(raw, np.float16).reshape(height, width)[::-1].astype(np.float32)
 
     def finish(self, view: View) -> Floats32:
         """What the sensor sees through the lens, (H, W) float32, each pixel an area average.
@@ -113,23 +114,3 @@ class Canvas:
             drawn = cv2.sepFilter2D(drawn, cv2.CV_32F, kernel, kernel)
         bent = cv2.remap(drawn, view.columns, view.rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return np.asarray(bent, dtype=np.float32)
-
-    def finish_depth(self, view: View) -> Floats32:
-        """The drawn values at the nearest sample, unmixed: for depth, (H, W) float32."""
-        drawn = np.ascontiguousarray(self.pinhole(view))
-        return np.asarray(cv2.remap(drawn, view.columns, view.rows, cv2.INTER_NEAREST), np.float32)
-
-
-@cache
-def _context() -> moderngl.Context:
-    """The one off-screen context of this process: EGL where there is one."""
-    problems = []
-    for backend in ({"backend": "egl"}, {}):
-        try:
-            return moderngl.create_context(standalone=True, require=430, **backend)
-        except Exception as error:  # noqa: BLE001 - the library raises bare Exception
-            problems.append(str(error))
-    raise DeviceError(
-        "no OpenGL 4.3 context for the simulated actor: " + "; ".join(problems)
-        + "; install libegl1 and libgl1-mesa-dri"
-    )

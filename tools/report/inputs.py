@@ -142,8 +142,10 @@ class ReportInputs:
         if self.calibration is None:
             return self.told
         document = json_object(self.calibration)
-        inner = document.get("report")
-        return inner if isinstance(inner, dict) else document
+        if "cameras" in document:  # a cameras.json, which may say nothing of how it came to be
+            inner = document.get("report")
+            return inner if isinstance(inner, dict) else {}
+        return document
 
     @cached_property
     def face_rig(self) -> FaceRig | None:

@@ -1,4 +1,4 @@
-"""The sections that need no picture: array layout, capture ledger, timings, numbers."""
+"""The sections that need no picture: array layout, timings, numbers and settings."""
 
 from __future__ import annotations
 
@@ -10,14 +10,10 @@ import numpy as np
 
 from capture.arrays import Floats
 from capture.camera import Camera, CameraArray
-from capture.judgement import Colour, judge
-from capture.ledger import Ledger, read_ledger
-from capture.ledger import Verdict as Fate
-from tools.report.charts import Labels, bar_chart, matrix_chart
-from tools.report.inputs import ReportInputs, TakeInputs
+from tools.report.charts import Labels, bar_chart
+from tools.report.inputs import ReportInputs
 from tools.report.page import (
     Section,
-    Verdict,
     facts,
     figure,
     flattened,
@@ -29,13 +25,6 @@ from tools.report.svg import drawing, element, escape, text
 
 _VIEW = 480.0
 _VOLUME_MM = 150.0  # radius of the drawn volume when there is no neutral
-_FATES = {
-    Fate.OK: "#9fd3b8",
-    Fate.INCOMPLETE: "#e69f00",
-    Fate.LOST: "#d55e00",
-    Fate.MISSED_TRIGGER: "#7b3294",
-    Fate.MISSING: "#222831",
-}
 
 
 def layout_section(inputs: ReportInputs) -> list[Section]:
@@ -70,47 +59,6 @@ def layout_section(inputs: ReportInputs) -> list[Section]:
             body=facts(numbers) + gallery(views, "wide"),
         )
     ]
-
-
-def capture_section(inputs: ReportInputs) -> list[Section]:
-    """Each take's ledger as a matrix of triggers and devices, with counts."""
-    parts, verdicts = [], []
-    for item in inputs.takes:
-        path = item.folder / "ledger.csv"
-        if not path.is_file():
-            continue
-        ledger = read_ledger(path)
-        verdict = ledger_verdict(item.take.name, ledger)
-        verdicts.append(verdict)
-        parts.append(f"<h3>{escape(item.take.name)}</h3>")
-        parts.append(facts(_capture_facts(item, ledger)))
-        words = {fate: fate.value.replace("_", " ") for fate in Fate}
-        rows = [
-            [words[ledger.entry(k, device).verdict] for k in range(ledger.triggers)]
-            for device in ledger.devices
-        ]
-        chart = matrix_chart(
-            ledger.devices,
-            rows,
-            {words[fate]: _FATES[fate] for fate in Fate},
-            Labels(title=f"ledger of {item.take.name}", x="trigger index"),
-        )
-        if verdict.level == "good" and len(inputs.takes) > 1:
-            parts.append(folded("ledger, every trigger of every device", chart))
-        else:
-            parts.append(figure(chart, "Every trigger of every device has exactly one verdict."))
-    if not parts:
-        return []
-    return [
-        Section(anchor="capture", title="Capture", body="".join(parts), verdicts=tuple(verdicts))
-    ]
-
-
-def ledger_verdict(name: str, ledger: Ledger) -> Verdict:
-    """The operator's verdict on a take, as its ledger gives it."""
-    judgement = judge(ledger)
-    level = {Colour.GREEN: "good", Colour.AMBER: "warn", Colour.RED: "bad"}[judgement.colour]
-    return Verdict(level=level, subject=f"Capture of {name}:", words=judgement.sentence)
 
 
 def timing_section(inputs: ReportInputs) -> list[Section]:
@@ -252,17 +200,6 @@ def _widest(array: CameraArray, target: Floats) -> float:
     rays = np.array([camera.centre - target for camera in array])
     rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-9)
     return float(np.degrees(np.arccos(np.clip(rays @ rays.T, -1.0, 1.0)).max()))
-
-
-def _capture_facts(item: TakeInputs, ledger: Ledger) -> dict[str, object]:
-    manifest = item.take.manifest
-    counts = {
-        f"{fate.value.replace('_', ' ')}": count for fate, count in ledger.counts().items() if count
-    }
-    values: dict[str, object] = {"devices": len(ledger.devices), "triggers": ledger.triggers}
-    if manifest.period_ns:
-        values["rate, frames/s"] = 1e9 / manifest.period_ns
-    return values | counts | flattened(manifest.remarks)
 
 
 def _span(values: Any) -> str:

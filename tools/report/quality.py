@@ -14,7 +14,7 @@ from tools.report.svg import escape, number
 from track.performance import Performance
 
 _UNITS = ("px", "mm", "ms", "s", "deg")
-_FRONT = ("ncc", "reproj", "sample", "residual", "flow", "match")  # shown before the rest
+_FRONT = ("correlation", "ncc", "residual", "reproj", "sample", "views")  # shown before the rest
 _OPEN = 4  # curves shown open; the rest is folded away
 _GOOD_RMS_MM, _FAIR_RMS_MM = 0.6, 1.2
 _GOOD_SEEN, _FAIR_SEEN = 0.35, 0.15  # share of vertices that are followed surely, worst frame
@@ -78,6 +78,11 @@ def unit_of(name: str) -> str:
     return f" ({last})" if last in _UNITS and last != name else ""
 
 
+def _rank(name: str) -> int:
+    lower = name.lower()
+    return next((rank for rank, word in enumerate(_FRONT) if word in lower), len(_FRONT))
+
+
 def _columns(rows: list[Mapping[str, Any]]) -> dict[str, list[float]]:
     keys = [key for key in rows[0] if all(_is_number(row.get(key)) for row in rows)]
     return {key: [_float(row[key]) for row in rows] for key in keys}
@@ -89,6 +94,13 @@ def _is_number(value: object) -> bool:
 
 def _float(value: float | None) -> float:
     return float("nan") if value is None else float(value)
+
+
+def _lost(item: TakeInputs) -> list[object]:
+    rows = item.track_report.get("frames")
+    if not isinstance(rows, list):
+        return []
+    return [row.get("frame") for row in rows if isinstance(row, Mapping) and row.get("lost")]
 
 
 def _facts(performance: Performance) -> dict[str, object]:
@@ -134,6 +146,10 @@ def _error_chart(item: TakeInputs, frames: list[float]) -> str:
 
 def _verdict(item: TakeInputs, performance: Performance) -> Verdict:
     subject = f"Tracking of {item.take.name}:"
+    lost = _lost(item)
+    if lost:
+        words = f"{len(lost)} frames were lost, the first of them {lost[0]}"
+        return Verdict(level="bad", subject=subject, words=words)
     if item.errors is not None and item.errors.track_mm is not None:
         rms = float(np.sqrt(np.nanmean(item.errors.track_mm**2)))
         last = float(np.sqrt(np.nanmean(item.errors.track_mm[-1] ** 2)))

@@ -10,14 +10,10 @@ from capture.camera import CameraArray
 from capture.progress import Progress, silent
 from tools.report.calibration import calibration_section
 from tools.report.inputs import ReportInputs, TakeInputs
-from tools.report.overview import (
-    capture_section,
-    layout_section,
-    numbers_section,
-    timing_section,
-)
+from tools.report.overview import layout_section, numbers_section, timing_section
 from tools.report.page import Section, write_page
 from tools.report.quality import quality_section
+from tools.report.recording import capture_section
 from tools.report.shapes import rig_section
 from tools.report.surfaces import overlay_section, scan_section
 from tools.report.svg import escape

@@ -63,12 +63,17 @@ class Studio:
         return shown
 
     def visible(self, vertices: Floats, camera: Camera, slack_mm: float = 1.5) -> Bools:
-        """Which vertices (V,) the camera sees, with the mesh itself in the way."""
-        depth = self._rasterizer.render(camera, vertices).depth
+        """Which vertices (V,) the camera sees, with the mesh itself in the way.
+
+        A vertex is compared with the farthest surface within a pixel of it, because on steep
+        skin the nearest pixel centre alone may lie well in front of it.
+        """
+        depth = np.nan_to_num(self._rasterizer.render(camera, vertices).depth, nan=0.0)
+        farthest = np.asarray(cv2.dilate(depth, np.ones((3, 3), np.uint8)))
         pixels, own = camera.project(vertices), camera.depths(vertices)
         inside = camera.contains(pixels)
         column, row = np.rint(np.where(inside[:, None], pixels, 0.0)).astype(int).T
-        near = depth[np.minimum(row, camera.height - 1), np.minimum(column, camera.width - 1)]
+        near = farthest[np.minimum(row, camera.height - 1), np.minimum(column, camera.width - 1)]
         seen: Bools = inside & (own <= near + slack_mm)
         return seen
 

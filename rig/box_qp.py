@@ -9,6 +9,7 @@ import numpy as np
 
 from capture.arrays import Floats, check_shape
 from capture.errors import SolveError
+from rig.ranges import run_ranges
 
 _TOLERANCE = 1e-11  # of the gradient's scale: how far a sign may be wrong and count as zero
 _PATIENCE = 4  # full exchanges allowed without progress before one index at a time
@@ -49,8 +50,9 @@ def solve_box_qp(
     )
     out = np.empty(linears.shape)
     failed = np.zeros(len(linears), dtype=np.int64)
-    solve = _solve_batch
-    solve(
+    run_ranges(
+        _solve_batch,
+        len(linears),
         np.ascontiguousarray(hessians, dtype=np.float64),
         np.ascontiguousarray(linears, dtype=np.float64),
         np.ascontiguousarray(lower, dtype=np.float64),
@@ -80,11 +82,12 @@ def kkt_residual(hessian: Floats, linear: Floats, bounds: tuple[Floats, Floats],
     return float(np.abs(x - np.clip(x - gradient, *bounds)).max(initial=0.0))
 
 
-@numba.njit(cache=True, parallel=True)
+@numba.njit(cache=True, nogil=True)
 def _solve_batch(
-    hessians: Any, linears: Any, lower: Any, upper: Any, start: Any, out: Any, failed: Any
-) -> None:
-    for i in numba.prange(linears.shape[0]):
+    begin: int, end: int, hessians: Any, linears: Any, lower: Any, upper: Any, start: Any, out: Any,
+    failed: Any,
+) -> None:  # fmt: skip
+    for i in range(begin, end):
         h = hessians[i] if hessians.shape[0] > 1 else hessians[0]
         failed[i] = _solve_one(h, linears[i], lower[i], upper[i], start[i], out[i])
 

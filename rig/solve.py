@@ -11,8 +11,17 @@ from capture.progress import Progress, silent
 from rig.gradient import gradient_operator
 from rig.template import Template
 from rig.transfer import transfer_shapes
-from rig.update import Evidence, UpdatePriors, mean_vertex_area, update_shapes
+from rig.update import (
+    Evidence,
+    UpdatePriors,
+    mean_vertex_area,
+    offset_stiffness,
+    update_shapes,
+)
 from rig.weights import WeightPriors, place_heads, solve_weights, sum_frames
+
+
+_RETRANSFER_MM = 0.05  # root mean square move of the neutral that makes the transfer stale
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,8 +144,8 @@ def personalise(
 ) -> tuple[Fit, Fit, list[Iteration]]:
     """Transfer the template, then alternate weights with shapes until the energy settles.
 
-    The targets D* and the gradient operator belong to the neutral they were made on: both are
-    rebuilt on the new neutral after every update, so that they never lag behind it.
+    The targets D* belong to the neutral they were made on: they are made again once the neutral has
+    moved from there. The gradient operator is rebuilt on the current neutral at every update.
 
     Args:
         template: shapes that all move something.
@@ -155,12 +164,12 @@ def personalise(
     triangles = template.mesh.triangles
     targets = transfer_shapes(template, neutral, schedule.mask_tolerance)
     first = pose_frames(neutral, targets, seen, schedule.weights)
-    fit, turns = first, list[Iteration]()
+    fit, carried, turns = first, neutral, list[Iteration]()
     progress(0, schedule.iterations, "rig")
     for turn in range(schedule.iterations):
         evidence = Evidence(_undo_motion(fit, seen), seen.confidence, fit.weights)
         neutral, deltas = update_shapes(
-            fit.neutral, triangles, targets, support, evidence, schedule.update
+            fit.neutral, triangles, targets, support, evidence, schedule.update, fit.deltas
         )
         start = neutral - fit.neutral
         turns.append(_measure(fit, (neutral, deltas, start), targets, seen, schedule, triangles))
@@ -171,9 +180,15 @@ def personalise(
         )
         if settled or turn + 1 == schedule.iterations:
             break
-        targets = transfer_shapes(template, neutral, schedule.mask_tolerance)
+        if _distance_rms(neutral, carried) > _RETRANSFER_MM:
+            targets = transfer_shapes(template, neutral, schedule.mask_tolerance)
+            carried = neutral
     progress(schedule.iterations, schedule.iterations, "rig")
     return first, fit, turns
+
+
+def _distance_rms(a: Floats, b: Floats) -> float:
+    return float(np.sqrt(((a - b) ** 2).sum(axis=1).mean()))
 
 
 def _undo_motion(fit: Fit, seen: Observations) -> Floats:
@@ -204,8 +219,7 @@ def _measure(
     return Iteration(
         data=float(((seen.confidence * away) ** 2).sum()),
         gradient=float((bent**2).sum()) * priors.gradient_mm2 / area,
-        offset=priors.offset * float((change[:, 1:] ** 2).sum())
-        + priors.neutral_offset * float((shift**2).sum()),
+        offset=float((offset_stiffness(targets, priors)[:, :, None] * change**2).sum()),
         rms_mm=weighted_rms(away, seen.confidence),
         worst_mm=float(away[frame, vertex]),
         worst_vertex=int(vertex),

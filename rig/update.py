@@ -12,8 +12,10 @@ from scipy import sparse
 from capture.arrays import Bools, Floats, Ints, Ints32, check_shape
 from capture.errors import SolveError
 from rig.gradient import gradient_operator
+from rig.ranges import run_ranges
 from rig.transfer import factorised
 
+_STILL = 0.02  # of a shape's extent: smaller displacements count as this much
 _DIRECT_UNKNOWNS = 12_000  # up to here one sparse factorisation is faster than iterating
 
 
@@ -27,6 +29,8 @@ class UpdatePriors:
             depend on how finely the face is meshed: sqrt(gradient / offset) is the distance, in mm,
             over which corrections are smoothed.
         offset: lambda_d, the strength of E_d = |D - D*|^2 (1: one sure observation at weight 1).
+        relative_mm2: added to it at each vertex of each shape, divided by the squared displacement
+            that the target has there: what hardly moves on the template hardly changes.
         neutral_offset: the same for the neutral's column.
         tolerance: relative residual at which iterating ends.
         iterations: most steps of the iterative solver.
@@ -34,8 +38,9 @@ class UpdatePriors:
 
     gradient_mm2: float = 1.0
     offset: float = 0.05
+    relative_mm2: float = 0.3
     neutral_offset: float = 0.05
-    tolerance: float = 1e-8
+    tolerance: float = 1e-5
     iterations: int = 2000
 
 
@@ -87,6 +92,7 @@ def update_shapes(
     support: Bools,
     evidence: Evidence,
     priors: UpdatePriors,
+    start: Floats | None = None,
 ) -> tuple[Floats, Floats]:
     """Solve Ma et al. Eq 7 with the neutral column: new neutral and shapes, all coordinates at once.
 
@@ -97,6 +103,7 @@ def update_shapes(
         support: (B, V) where each shape may move; the neutral's column is exempt.
         evidence: the frames.
         priors: strengths.
+        start: (B, V, 3) shapes to start iterating from, mm; the targets when None.
 
     Returns:
         neutral (V, 3) and shapes (B, V, 3), mm, in the rig space of the input.
@@ -112,11 +119,15 @@ def update_shapes(
         offsets=(evidence.offsets, "F V 3"), confidence=(evidence.confidence, "F V"),
         weights=(evidence.weights, "F B"),
     )  # fmt: skip
+    targets = np.where(support[:, :, None], targets, 0.0)
     system = assemble(neutral, triangles, targets, support, evidence, priors)
     if len(system.columns) <= _DIRECT_UNKNOWNS:
         change = solve_direct(system)
     else:
-        change = solve_iterative(system, priors.tolerance, priors.iterations)
+        guess = np.zeros((len(neutral), len(targets) + 1, 3))
+        if start is not None:
+            guess[:, 1:] = (start - targets).transpose(1, 0, 2)
+        change = solve_iterative(system, guess[system.position >= 0], priors)
     full = np.zeros((len(neutral), len(targets) + 1, 3))
     full[system.position >= 0] = change
     moved = full.transpose(1, 0, 2)
@@ -151,14 +162,21 @@ def assemble(
     block_starts = np.concatenate([[0], np.cumsum(counts**2)]).astype(np.int64)
     factors = np.concatenate([np.ones((len(evidence.weights), 1)), evidence.weights], axis=1)
     residual = evidence.offsets - np.tensordot(evidence.weights, targets, axes=1)
-    stiffness = np.full(len(targets) + 1, priors.offset)
-    stiffness[0] = priors.neutral_offset
+    stiffness = offset_stiffness(targets, priors)[active]
     square = np.asarray(evidence.confidence, dtype=np.float64) ** 2
     blocks = np.empty(int(block_starts[-1]))
     right = np.empty((len(columns), 3))
-    _fill(starts, columns, block_starts, square.T.copy(), factors,
-          np.ascontiguousarray(residual.transpose(1, 0, 2)), stiffness, blocks, right)  # fmt: skip
+    run_ranges(_fill, len(counts), starts, columns, block_starts, square.T.copy(), factors,
+               np.ascontiguousarray(residual.transpose(1, 0, 2)), stiffness, blocks, right)  # fmt: skip
     return UpdateSystem(starts, columns, position, block_starts, blocks, laplacian, right)
+
+
+def offset_stiffness(targets: Floats, priors: UpdatePriors) -> Floats:
+    """Strength (V, B + 1) of E_d at each vertex of the neutral (0) and of each target (B, V, 3)."""
+    square = (targets**2).sum(axis=2).T
+    floor = (_STILL * np.sqrt(square.max(axis=0, initial=0.0))) ** 2 + 1e-12
+    shapes = priors.offset + priors.relative_mm2 / np.maximum(square, floor)
+    return np.concatenate([np.full((len(square), 1), priors.neutral_offset), shapes], axis=1)
 
 
 def mean_vertex_area(vertices: Floats, triangles: Ints32) -> float:
@@ -190,60 +208,61 @@ def solve_direct(system: UpdateSystem) -> Floats:
     return solved
 
 
-def solve_iterative(system: UpdateSystem, tolerance: float, iterations: int) -> Floats:
+def solve_iterative(system: UpdateSystem, start: Floats, priors: UpdatePriors) -> Floats:
     """Conjugate gradients on the active system, preconditioned by each vertex's block: (N, 3).
 
     Raises:
-        SolveError: when the relative residual stays above `tolerance`.
+        SolveError: when the relative residual stays above `priors.tolerance`.
     """
-    lap = system.laplacian
+    lap, count = system.laplacian, len(system.starts) - 1
     inverse = np.empty_like(system.blocks)
-    _invert(system.starts, system.block_starts, system.blocks, lap.diagonal(), inverse)
+    run_ranges(_invert, count, system.starts, system.block_starts, system.blocks, lap.diagonal(), inverse)
     matrix = (system.starts, system.columns, system.block_starts, system.blocks)
     mesh = (system.position, lap.indptr, lap.indices, lap.data)
-    solved = np.zeros_like(system.right)
-    residual = system.right.copy()
-    goal = tolerance * np.maximum(np.sqrt((residual**2).sum(axis=0)), 1e-300)
+    solved = np.array(start, dtype=np.float64)
+    product = np.empty_like(solved)
+    run_ranges(_multiply, count, *matrix, *mesh, solved, product)
+    residual = system.right - product
+    goal = priors.tolerance * np.maximum(np.sqrt((system.right**2).sum(axis=0)), 1e-300)
     step = np.empty_like(residual)
-    _precondition(system.starts, system.block_starts, inverse, residual, step)
+    run_ranges(_precondition, count, system.starts, system.block_starts, inverse, residual, step)
     direction = step.copy()
-    product = np.empty_like(residual)
     energy = (residual * step).sum(axis=0)
-    for _ in range(iterations):
+    for _ in range(priors.iterations):
         if (np.sqrt((residual**2).sum(axis=0)) <= goal).all():
             return solved
-        _multiply(*matrix, *mesh, direction, product)
+        run_ranges(_multiply, count, *matrix, *mesh, direction, product)
         curvature = (direction * product).sum(axis=0)
         length = np.where(curvature > 0.0, energy / np.where(curvature > 0.0, curvature, 1.0), 0.0)
         solved += length * direction
         residual -= length * product
-        _precondition(system.starts, system.block_starts, inverse, residual, step)
+        run_ranges(_precondition, count, system.starts, system.block_starts, inverse, residual, step)
         renewed = (residual * step).sum(axis=0)
         direction *= np.where(energy > 0.0, renewed / np.where(energy > 0.0, energy, 1.0), 0.0)
         direction += step
         energy = renewed
-    reached = float((np.sqrt((residual**2).sum(axis=0)) / goal).max() * tolerance)
+    reached = float((np.sqrt((residual**2).sum(axis=0)) / goal).max() * priors.tolerance)
     raise SolveError(
-        f"blendshape update: relative residual {reached:.2g} after {iterations} iterations, "
-        f"asked for {tolerance:.2g}; raise the offset strength or the tolerance"
+        f"blendshape update: relative residual {reached:.2g} after {priors.iterations} iterations, "
+        f"asked for {priors.tolerance:.2g}; raise the offset strength or the tolerance"
     )
 
 
-@numba.njit(cache=True, parallel=True)
+@numba.njit(cache=True, nogil=True)
 def _fill(
-    starts: Any, columns: Any, block_starts: Any, square: Any, factors: Any, residual: Any,
-    stiffness: Any, blocks: Any, right: Any,
+    begin: int, end: int, starts: Any, columns: Any, block_starts: Any, square: Any, factors: Any,
+    residual: Any, stiffness: Any, blocks: Any, right: Any,
 ) -> None:  # fmt: skip
     """Per vertex: sum_f m^2 w w^T + stiffness, and sum_f m^2 w residual."""
     frames = factors.shape[0]
-    for v in numba.prange(starts.shape[0] - 1):
+    for v in range(begin, end):
         n = starts[v + 1] - starts[v]
         base = block_starts[v]
         for i in range(n):
             a = columns[starts[v] + i]
             for j in range(i + 1):
                 b = columns[starts[v] + j]
-                total = stiffness[a] if i == j else 0.0
+                total = stiffness[starts[v] + i] if i == j else 0.0
                 for f in range(frames):
                     total += square[v, f] * factors[f, a] * factors[f, b]
                 blocks[base + i * n + j] = total
@@ -255,10 +274,12 @@ def _fill(
                 right[starts[v] + i, c] = total
 
 
-@numba.njit(cache=True, parallel=True)
-def _invert(starts: Any, block_starts: Any, blocks: Any, diagonal: Any, inverse: Any) -> None:
+@numba.njit(cache=True, nogil=True)
+def _invert(
+    begin: int, end: int, starts: Any, block_starts: Any, blocks: Any, diagonal: Any, inverse: Any
+) -> None:
     """Invert each vertex's block, its Laplacian diagonal added, by Gauss-Jordan (it is SPD)."""
-    for v in numba.prange(starts.shape[0] - 1):
+    for v in range(begin, end):
         n = starts[v + 1] - starts[v]
         base = block_starts[v]
         a = np.empty((n, n))
@@ -282,9 +303,11 @@ def _invert(starts: Any, block_starts: Any, blocks: Any, diagonal: Any, inverse:
                 inverse[base + i * n + j] = 0.5 * (a[i, j] + a[j, i])
 
 
-@numba.njit(cache=True, parallel=True)
-def _precondition(starts: Any, block_starts: Any, inverse: Any, x: Any, out: Any) -> None:
-    for v in numba.prange(starts.shape[0] - 1):
+@numba.njit(cache=True, nogil=True)
+def _precondition(
+    begin: int, end: int, starts: Any, block_starts: Any, inverse: Any, x: Any, out: Any
+) -> None:
+    for v in range(begin, end):
         first = starts[v]
         n = starts[v + 1] - first
         base = block_starts[v]
@@ -298,12 +321,12 @@ def _precondition(starts: Any, block_starts: Any, inverse: Any, x: Any, out: Any
             out[first + i, 0], out[first + i, 1], out[first + i, 2] = sx, sy, sz
 
 
-@numba.njit(cache=True, parallel=True)
+@numba.njit(cache=True, nogil=True)
 def _multiply(
-    starts: Any, columns: Any, block_starts: Any, blocks: Any,
+    begin: int, end: int, starts: Any, columns: Any, block_starts: Any, blocks: Any,
     position: Any, indptr: Any, indices: Any, data: Any, x: Any, out: Any,
 ) -> None:  # fmt: skip
-    for v in numba.prange(starts.shape[0] - 1):
+    for v in range(begin, end):
         first = starts[v]
         n = starts[v + 1] - first
         base = block_starts[v]

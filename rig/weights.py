@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from capture.arrays import Bools, Floats, check_shape
+from capture.arrays import Bools, Floats, Ints, check_shape
 from rig.box_qp import solve_box_qp
 
 _RIDGE = 1e-9  # of the Gram's mean diagonal: keeps shapes that move alike solvable
@@ -28,6 +28,9 @@ class WeightPriors:
             sums over 6.7k vertices in cm is 0.0015 here.
         smoothness: strength of (w_f - w_(f-1))^2 between contiguous frames, as a fraction of each
             shape's own mean squared displacement; 0 turns it off.
+        evidence_mm2: what a shape must take off the frame's mean squared residual to stay active; the
+            least useful goes first, until all that remain earn their place. About 4 times the part
+            of the tracking error that one shape can imitate; 0 keeps every shape.
         debias: solve again, without sparsity, with the shapes that sparsity left active: keeps its
             choice and takes back its shrinking.
         active_above: weight above which a shape counts as active.
@@ -37,6 +40,7 @@ class WeightPriors:
 
     sparsity_mm2: float = 0.03
     smoothness: float = 0.002
+    evidence_mm2: float = 0.008
     debias: bool = True
     active_above: float = 0.01
     iterations: int = 60
@@ -122,11 +126,39 @@ def solve_weights(
     check_shape(cross=(sums.cross, "F * 3 3"), contiguous=(contiguous, "F"))
     weights = np.zeros((frames, shapes)) if start is None else np.array(start, dtype=np.float64)
     ceiling = np.where(sums.seen[:, None], np.ones((frames, shapes)), 0.0)
-    weights = _alternate(sums, contiguous, priors, weights, ceiling, priors.sparsity_mm2)
+    weights, hessian = _alternate(
+        sums, contiguous, priors, weights, ceiling, priors.sparsity_mm2
+    )
     if priors.debias and priors.sparsity_mm2 > 0.0:
         ceiling = ceiling * (weights > priors.active_above)
-        weights = _alternate(sums, contiguous, priors, weights * ceiling, ceiling, 0.0)
+        weights, hessian = _alternate(sums, contiguous, priors, weights * ceiling, ceiling, 0.0)
+    while priors.evidence_mm2 > 0.0:
+        weakest, useless = _weakest(weights, hessian, priors.evidence_mm2)
+        if not useless.any():
+            break
+        ceiling[useless, weakest[useless]] = 0.0
+        strength = 0.0 if priors.debias else priors.sparsity_mm2
+        weights, hessian = _alternate(
+            sums, contiguous, priors, np.minimum(weights, ceiling), ceiling, strength
+        )
     return weights, place_heads(sums, weights)
+
+
+def _weakest(weights: Floats, hessian: Floats, evidence_mm2: float) -> tuple[Ints, Bools]:
+    """Each frame's active shape whose loss would cost least, and whether that is too little.
+
+    Taking variable k out of a least-squares fit raises its mean squared residual by
+    w_k^2 / (H^-1)_kk, the others and the head's rotation having been fitted again.
+    """
+    frames, shapes = weights.shape
+    active = np.concatenate([weights > 0.0, np.ones((frames, 3), dtype=bool)], axis=1)
+    reduced = np.where(active[:, :, None] & active[:, None, :], hessian, 0.0)
+    diagonal = np.arange(shapes + 3)
+    reduced[:, diagonal, diagonal] += ~active
+    spread = np.linalg.inv(reduced)[:, diagonal[:shapes], diagonal[:shapes]]
+    cost = np.where(weights > 0.0, weights**2 / np.maximum(spread, 1e-300), np.inf)
+    weakest = np.argmin(cost, axis=1)
+    return weakest, cost[np.arange(frames), weakest] < evidence_mm2
 
 
 def place_heads(sums: FrameSums, weights: Floats) -> Floats:
@@ -149,7 +181,7 @@ def _alternate(
     weights: Floats,
     ceiling: Floats,
     sparsity_mm2: float,
-) -> Floats:
+) -> tuple[Floats, Floats]:
     frames, shapes = weights.shape
     gram = sums.gram[:, 1:, 1:]
     scale = np.einsum("fkk->fk", gram)
@@ -172,7 +204,7 @@ def _alternate(
         weights = solved
         if change <= priors.tolerance:
             break
-    return weights
+    return weights, hessian
 
 
 def _linearise(sums: FrameSums, rotations: Floats, hessian: Floats) -> Floats:

@@ -5,7 +5,6 @@ The only module that imports pygltflib. Metres, +Y up.
 
 from __future__ import annotations
 
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -98,10 +97,10 @@ class _Scene:
     """A glTF document with one mesh, filled piece by piece."""
 
     def __init__(self) -> None:
-        if find_spec("pygltflib") is None:
-            raise ExtraError("export to glTF", "pygltflib", "gltf")
-        import pygltflib
-
+        try:
+            import pygltflib
+        except ImportError as error:
+            raise ExtraError("export to glTF", "pygltflib", "gltf") from error
         self._lib = pygltflib
         self._bytes = bytearray()
         self._primitive = pygltflib.Primitive(attributes=pygltflib.Attributes(), targets=[])

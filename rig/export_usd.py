@@ -5,7 +5,6 @@ The only module that imports pxr.
 
 from __future__ import annotations
 
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -103,14 +102,19 @@ def write_usd_performance(path: Path, performance: Performance, fps: float) -> N
 
 
 def _need_usd() -> None:
-    if find_spec("pxr") is None:
-        raise ExtraError("export to USD", "usd-core", "usd")
+    try:
+        import pxr  # noqa: F401
+    except ImportError as error:
+        raise ExtraError("export to USD", "usd-core", "usd") from error
 
 
 def _stage(path: Path, fps: float, count: int) -> Usd.Stage:
-    from pxr import Usd, UsdGeom
+    from pxr import Tf, Usd, UsdGeom
 
-    stage = Usd.Stage.CreateNew(str(path))
+    try:
+        stage = Usd.Stage.CreateNew(str(path))
+    except Tf.ErrorException as error:
+        raise WorkError(f"{path}: OpenUSD could not make the file: {error}") from error
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
     UsdGeom.SetStageMetersPerUnit(stage, 0.001)
     stage.SetTimeCodesPerSecond(fps)

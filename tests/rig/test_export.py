@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import re
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from capture.archive import read_archive, write_archive
-from capture.errors import InputError, SettingsError, ShapeError
+from capture.errors import ExtraError, InputError, SettingsError, ShapeError
 from recon.mesh import read_obj
 from rig.export import export
 from rig.export_ma import euler_xyz, maya_names
@@ -191,6 +192,25 @@ def test_the_same_rig_gives_the_same_bytes(tmp_path: Path, suffix: str) -> None:
     export(source, tmp_path / f"two{suffix}")
     one, two = ((tmp_path / f"{name}{suffix}").read_bytes() for name in ("one", "two"))
     assert one == two
+
+
+@pytest.mark.parametrize(
+    ("module", "suffix", "package", "extra"),
+    [("pxr", ".usdc", "usd-core", "usd"), ("pygltflib", ".glb", "pygltflib", "gltf")],
+)
+def test_a_missing_extra_is_named(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    module: str,
+    suffix: str,
+    package: str,
+    extra: str,
+) -> None:
+    source = rig_file(tmp_path)
+    monkeypatch.setitem(sys.modules, module, None)  # Python's own way to say: not installed
+    with pytest.raises(ExtraError, match=rf"needs {package}, .*likeness\[{extra}\]"):
+        export(source, tmp_path / f"out{suffix}")
+    assert sorted(path.name for path in tmp_path.iterdir()) == [source.name]
 
 
 def test_posed_rig_moves(tmp_path: Path) -> None:

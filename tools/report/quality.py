@@ -64,7 +64,7 @@ def per_frame(report: Mapping[str, Any], count: int) -> dict[str, list[float]]:
                 found |= _columns(value)
             elif all(_is_number(entry) for entry in value):
                 found[key] = [_float(entry) for entry in value]
-    order = sorted(found, key=lambda name: not any(w in name.lower() for w in _FRONT))
+    order = sorted(found, key=_rank)
     return {
         name: found[name]
         for name in order

@@ -1,8 +1,8 @@
 """Frames into frame sets: by trigger index on a common clock, never by the order of arrival.
 
 A frame is placed by two steps from the frame of its device before it: that of its number and that
-of its time, in trigger periods. Where the two disagree, the one whose arrival is the more usual is
-right: a frame cannot arrive before its trigger, and seldom takes much longer than the others.
+of its time, in trigger periods. Where the two disagree, its arrival is asked too: a frame cannot
+arrive before its trigger, and seldom takes much longer than those before it.
 
 =========  ==============  =====================================================================
 number     time            what it means
@@ -13,10 +13,11 @@ n          n               n - 1 frames LOST in transport or host
 m < n      n               m - 1 lost and n - m missed, in an unknown order
 n          1               the numbers jumped (a reset); the frame is kept
 < 0        forward         the numbers jumped back (a reset); the frame is kept
-0          any             DUPLICATE: quarantined
-< 0        back            STALE: quarantined
-n          not near a      the clock jumped; the frame is kept, placed by its number
+< 0        back, a jump    numbers and clock began again; the frame is kept, placed by arrival
+n          not near a      the clock jumped; the frame is kept, placed by number and arrival
            whole number
+0          any             DUPLICATE: quarantined, even when its time is new
+< 0        the same < 0    STALE: quarantined, and so is any frame that was seen before
 =========  ==============  =====================================================================
 """
 
@@ -36,6 +37,12 @@ from capture.ledger import Ledger, LedgerEntry, Oddity, Remark, Verdict
 _NEAR = 0.2  # of a period: further from a whole number of periods, a clock has jumped
 _REMEMBERED = 64
 
+# What it takes to believe of a frame whose number and time disagree. A trigger is missed more often
+# than the host is late, and that more often than a clock or a number jumps; a device that lost its
+# clock has likely missed triggers with it. Nothing arrives before it was exposed.
+_COST_MISSED, _COST_LATE, _COST_CLOCK, _COST_NUMBER, _COST_EARLY = 1.0, 1.5, 2.0, 2.0, 10.0
+_IMPOSSIBLE = _COST_EARLY
+
 
 @dataclass(frozen=True)
 class TriggerTrain:
@@ -44,12 +51,14 @@ class TriggerTrain:
     Attributes:
         start_ns: trigger 0, by the host's clock.
         period_ns: from trigger to trigger.
-        count: how many belong to the take; pre-roll is before 0, post-roll from `count` on.
+        count: how many belong to the take; post-roll is from `count` on.
+        pre_roll: how many are sent before trigger 0.
     """
 
     start_ns: int
     period_ns: int
     count: int
+    pre_roll: int = 0
 
     def __post_init__(self) -> None:
         if self.period_ns < 1 or self.count < 1:
@@ -158,61 +167,67 @@ class Collator:
 
     def _first(self, track: _Track, event: FrameEvent) -> int:
         phase = (track.model.to_host(event.t_dev_ns) - self.train.start_ns) / self.train.period_ns
+        newest = (event.t_host_ns - self.train.start_ns) // self.train.period_ns
         index = round(phase)
-        if abs(phase - index) > _NEAR:
-            self._remark(track, Oddity.CLOCK_STEP, event)
-        return index
+        if abs(phase - index) <= _NEAR and -self.train.pre_roll <= index <= newest:
+            return index
+        self._remark(track, Oddity.CLOCK_STEP, event)
+        return max(newest, -self.train.pre_roll)
 
     def _next(self, track: _Track, last: FrameEvent, event: FrameEvent) -> int | None:
         ids = _id_step(last.frame_id, event.frame_id, track.info.id_bits)
-        periods, near = self._time_step(last, event)
-        by_time = track.last_index + periods if near and periods >= 1 else None
+        step = (event.t_dev_ns - last.t_dev_ns) / self.train.period_ns
+        near = abs(step - round(step)) <= _NEAR
+        again = (event.frame_id, event.t_dev_ns) in track.seen or (near and round(step) == ids < 0)
+        if ids == 0 or again:
+            self._remark(track, Oddity.DUPLICATE if ids == 0 else Oddity.STALE, event)
+            if near and step > 0.5:
+                track.reasons[track.last_index + round(step)] = (Verdict.QUARANTINED, "")
+            return None
+        by_time = track.last_index + round(step) if near and step > 0.5 else None
         by_id = track.last_index + ids if ids >= 1 else None
-        if ids == 0 or (by_time is None and by_id is None):
-            return self._quarantine(track, event, ids)
-        track.aside = None
-        choices = [index for index in (by_time, by_id) if index is not None]
-        usual = median(track.lags_ns)
-        index = min(choices, key=lambda k: abs(event.t_host_ns - self.train.time_ns(k) - usual))
+        agreed = by_time is not None and by_time == by_id
+        index = by_time if agreed else self._weigh(track, event, by_time, by_id)
+        if index is None:
+            self._remark(track, Oddity.STALE, event)
+            return None
         if index != by_time:
             self._remark(track, Oddity.CLOCK_STEP, event)
             track.segments.append([])
-        if index != by_id and (by_id is None or by_id > index):
+        if by_id is None or by_id > index:
             self._remark(track, Oddity.ID_RESET, event)
         self._explain_gap(track, index, by_id)
         return index
 
-    def _quarantine(self, track: _Track, event: FrameEvent, ids: int) -> int | None:
-        known = (event.frame_id, event.t_dev_ns) in track.seen
-        before, track.aside = track.aside, None if known else event
-        if before is not None and not known:
-            periods, near = self._time_step(before, event)
-            together = _id_step(before.frame_id, event.frame_id, track.info.id_bits)
-            index = self._index_of_arrival(track, event)
-            if near and periods == together >= 1 and index > track.last_index:
-                # Two new frames in step with one another: the device began again.
-                self._remark(track, Oddity.ID_RESET, event)
-                self._remark(track, Oddity.CLOCK_STEP, event)
-                track.segments.append([])
-                self._explain_gap(track, index, None)
-                return index
-        self._remark(track, Oddity.DUPLICATE if ids == 0 else Oddity.STALE, event)
-        return None
+    def _weigh(
+        self, track: _Track, event: FrameEvent, by_time: int | None, by_id: int | None
+    ) -> int | None:
+        """The likeliest index of a frame whose number and time disagree; None when none is."""
+        period = self.train.period_ns
+        usual = median(track.lags_ns)
+        by_arrival = round((event.t_host_ns - self.train.start_ns - usual) / period)
+        best, least = None, _IMPOSSIBLE
+        for index in (by_time, by_id, by_arrival):
+            if index is None or index <= track.last_index:
+                continue
+            late = (event.t_host_ns - self.train.time_ns(index) - usual) / period
+            cost = _COST_EARLY if late < -0.5 else _COST_LATE if late > 0.5 else 0.0
+            cost += 0.0 if index == by_time else _COST_CLOCK
+            if by_id is None or by_id > index:
+                cost += _COST_NUMBER
+            elif by_id < index:
+                cost += _COST_MISSED
+            if cost < least:
+                best, least = index, cost
+        return best
 
     def _explain_gap(self, track: _Track, index: int, by_id: int | None) -> None:
         gap = range(track.last_index + 1, index)
         lost = len(gap) if by_id is None or by_id > index else by_id - track.last_index - 1
         note = "lost and missed in an unknown order" if 0 < lost < len(gap) else ""
         for place, k in enumerate(gap):
-            track.reasons[k] = (Verdict.LOST if place < lost else Verdict.MISSED_TRIGGER, note)
-
-    def _index_of_arrival(self, track: _Track, event: FrameEvent) -> int:
-        since = event.t_host_ns - self.train.start_ns - median(track.lags_ns)
-        return round(since / self.train.period_ns)
-
-    def _time_step(self, last: FrameEvent, event: FrameEvent) -> tuple[int, bool]:
-        step = (event.t_dev_ns - last.t_dev_ns) / self.train.period_ns
-        return round(step), abs(step - round(step)) <= _NEAR
+            verdict = Verdict.LOST if place < lost else Verdict.MISSED_TRIGGER
+            track.reasons.setdefault(k, (verdict, note))
 
     def _remark(self, track: _Track, oddity: Oddity, event: FrameEvent) -> None:
         index = max(track.last_index, -1)

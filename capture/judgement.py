@@ -16,6 +16,7 @@ _NAMED = 3
 _WORDS = {
     Verdict.INCOMPLETE: "sent an incomplete image at",
     Verdict.MISSED_TRIGGER: "missed the trigger of",
+    Verdict.QUARANTINED: "repeated a frame number at",
     Verdict.MISSING: "sent nothing for",
 }
 

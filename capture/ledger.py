@@ -30,6 +30,7 @@ class Verdict(StrEnum):
     INCOMPLETE = "incomplete"  # parts of the image did not arrive
     LOST = "lost"  # exposed, and lost in transport or host: the frame number skipped
     MISSED_TRIGGER = "missed_trigger"  # never exposed: time went on, the frame number did not
+    QUARANTINED = "quarantined"  # a frame came with a number that had been given before
     MISSING = "missing"  # no frame, and no other frame of the device around it to say why
 
 

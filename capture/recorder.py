@@ -110,7 +110,7 @@ def record_frames(
     lead = (settings.pre_roll + 1) * period
     if start_ns is None:
         start_ns = array.line.now_ns() + lead
-    train = TriggerTrain(start_ns, period, count)
+    train = TriggerTrain(start_ns, period, count, settings.pre_roll)
     try:
         array.line.wait(start_ns - lead)
         for device in array.devices:

@@ -1,0 +1,241 @@
+"""Collation: whatever goes wrong, frames are filed under the trigger that exposed them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from capture.clock_model import ClockModel
+from capture.collate import Collator, TriggerTrain
+from capture.devices.protocol import DeviceInfo, TriggerKind
+from capture.devices.simulated import Fault, FaultKind, SimulatedSettings
+from capture.errors import SettingsError
+from capture.frame import FrameEvent
+from capture.ledger import Oddity, Verdict
+from capture.mcap import ImageLayout
+from capture.recorder import RecordSettings
+from tests.capture.recording import array_of, cameras, misplaced, record, verdicts
+
+PRE = RecordSettings().pre_roll
+PERIOD = RecordSettings().period_ns
+
+
+def at(kind: FaultKind, trigger_index: int, amount_ns: int = 0) -> Fault:
+    return Fault(kind, PRE + trigger_index, amount_ns)
+
+
+def oddities(recording, device: str) -> list[Oddity]:  # type: ignore[no-untyped-def]
+    return [r.oddity for r in recording.ledger.remarks if r.device == device]
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_without_faults_every_pair_is_ok_and_every_image_in_place(seed: int) -> None:
+    recording, images = record(array_of(seed=seed))
+    assert recording.ledger.counts()[Verdict.OK] == 80
+    assert recording.ledger.remarks == ()
+    assert len(images) == 80
+    assert not misplaced(recording, images, cameras())
+
+
+CASES = {
+    "lost": ([at(FaultKind.LOSE_FRAME, 7)], {7: "lost"}, []),
+    "lost in a row": ([at(FaultKind.LOSE_FRAME, k) for k in (7, 8, 9)],
+                      dict.fromkeys((7, 8, 9), "lost"), []),
+    "missed": ([at(FaultKind.MISS_TRIGGER, 7)], {7: "missed_trigger"}, []),
+    "missed in a row": ([at(FaultKind.MISS_TRIGGER, k) for k in (3, 4)],
+                        dict.fromkeys((3, 4), "missed_trigger"), []),
+    "first lost": ([at(FaultKind.LOSE_FRAME, 0)], {0: "lost"}, []),
+    "first missed": ([at(FaultKind.MISS_TRIGGER, 0)], {0: "missed_trigger"}, []),
+    "last lost": ([at(FaultKind.LOSE_FRAME, 19)], {19: "lost"}, []),
+    "last missed": ([at(FaultKind.MISS_TRIGGER, 19)], {19: "missed_trigger"}, []),
+    "duplicate": ([at(FaultKind.DUPLICATE, 7)], {}, [Oddity.DUPLICATE]),
+    "stale": ([at(FaultKind.STALE, 7)], {}, [Oddity.STALE]),
+    "incomplete": ([at(FaultKind.INCOMPLETE, 7)], {7: "incomplete"}, []),
+    "clock steps ahead": ([at(FaultKind.CLOCK_STEP, 7, 12_345_678_901)], {}, [Oddity.CLOCK_STEP]),
+    "clock steps back": ([at(FaultKind.CLOCK_STEP, 7, -5_000_000_000)], {}, [Oddity.CLOCK_STEP]),
+    "clock steps a third of a period": ([at(FaultKind.CLOCK_STEP, 7, PERIOD // 3)], {},
+                                        [Oddity.CLOCK_STEP]),
+    "clock steps two whole periods": ([at(FaultKind.CLOCK_STEP, 7, 2 * PERIOD)], {},
+                                      [Oddity.CLOCK_STEP]),
+    "clock steps back a whole period": ([at(FaultKind.CLOCK_STEP, 7, -PERIOD)], {},
+                                        [Oddity.CLOCK_STEP]),
+    "clock steps while a frame is lost": (
+        [at(FaultKind.LOSE_FRAME, 7), at(FaultKind.CLOCK_STEP, 8, 999_999_999)],
+        {7: "lost"}, [Oddity.CLOCK_STEP]),
+    "numbers reset": ([at(FaultKind.ID_RESET, 7)], {}, [Oddity.ID_RESET]),
+    "numbers reset and a trigger missed": (
+        [at(FaultKind.MISS_TRIGGER, 6), at(FaultKind.ID_RESET, 7)], {6: "lost"}, [Oddity.ID_RESET]),
+    "all at once": (
+        [at(FaultKind.LOSE_FRAME, 2), at(FaultKind.MISS_TRIGGER, 5), at(FaultKind.DUPLICATE, 8),
+         at(FaultKind.STALE, 11), at(FaultKind.INCOMPLETE, 14)],
+        {2: "lost", 5: "missed_trigger", 14: "incomplete"}, [Oddity.DUPLICATE, Oddity.STALE]),
+    "lost then missed": (
+        [at(FaultKind.LOSE_FRAME, 7), at(FaultKind.MISS_TRIGGER, 8)],
+        {7: "lost", 8: "missed_trigger"}, []),
+    "silent": ([at(FaultKind.MISS_TRIGGER, k) for k in range(-PRE, 30)],
+               dict.fromkeys(range(20), "missing"), []),
+    "silent to the end": ([at(FaultKind.LOSE_FRAME, k) for k in range(15, 30)],
+                          dict.fromkeys(range(15, 20), "missing"), []),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("case", CASES)
+def test_each_fault_gets_its_verdict_and_moves_no_other_frame(case: str, seed: int) -> None:
+    faults, expected, odd = CASES[case]
+    recording, images = record(array_of(seed=seed, faults={"cam02": faults}))
+    assert verdicts(recording.ledger, "cam02") == expected
+    assert oddities(recording, "cam02") == odd
+    for other in ("cam00", "cam01", "cam03"):
+        assert verdicts(recording.ledger, other) == {}
+    assert sum(recording.ledger.counts().values()) == 80
+    assert len(images) == 80 - len(expected)
+    assert not misplaced(recording, images, cameras())
+
+
+@pytest.mark.parametrize("seed", range(25))
+def test_the_ledger_is_exact_for_random_faults_on_all_devices(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    kinds = [FaultKind.LOSE_FRAME, FaultKind.MISS_TRIGGER, FaultKind.DUPLICATE, FaultKind.STALE,
+             FaultKind.INCOMPLETE, FaultKind.CLOCK_STEP]  # fmt: skip
+    faults = {
+        camera.name: [
+            Fault(
+                kinds[int(rng.integers(len(kinds)))],
+                int(edge),
+                int(rng.integers(-(10**10), 10**10)),
+            )
+            for edge in rng.choice(40, size=6, replace=False)
+        ]
+        for camera in cameras(6)
+    }
+    for planned in faults.values():  # one reset a device: two in a row repeat a number
+        planned[0] = replace(planned[0], kind=FaultKind.ID_RESET)
+    recording, images = record(array_of(6, seed, faults), count=36)
+    ledger = recording.ledger
+    assert sum(ledger.counts().values()) == 36 * 6
+    assert len(images) == ledger.counts()[Verdict.OK]
+    assert {(e.trigger_index, e.device) for e in ledger.entries if e.verdict == "ok"} == set(images)
+    assert not misplaced(recording, images, cameras(6))
+    delivered = {(e.trigger_index, e.device): e.verdict for e in ledger.entries}
+    for name, planned in faults.items():
+        for k in range(36):
+            gone = {f.kind for f in planned if f.edge == k + PRE} & {
+                FaultKind.LOSE_FRAME, FaultKind.MISS_TRIGGER, FaultKind.INCOMPLETE
+            }  # fmt: skip
+            assert (delivered[k, name] != Verdict.OK) == bool(gone)
+
+
+def test_frame_numbers_wrap_from_65535_to_1() -> None:
+    settings = SimulatedSettings(id_bits=16)
+    array = array_of(2, settings=settings)
+    device = array.devices[0]
+    device._next_id = 65530  # type: ignore[attr-defined]
+    recording, images = record(array)
+    ids = [e.frame_id for e in recording.ledger.entries if e.device == "cam00"]
+    assert 65535 in ids
+    assert 0 not in ids
+    assert 1 in ids
+    assert recording.ledger.counts()[Verdict.OK] == 40
+    assert not misplaced(recording, images, cameras(2))
+
+
+@pytest.mark.parametrize("latency_ms", [0.0, 30.0, 90.0])
+def test_frames_that_arrive_periods_late_are_filed_all_the_same(latency_ms: float) -> None:
+    array = array_of(3)
+    slow = array.devices[1]
+    slow._settings = replace(slow._settings, latency_ms=latency_ms)  # type: ignore[attr-defined]
+    recording, images = record(array)
+    assert recording.ledger.counts()[Verdict.OK] == 60
+    assert not misplaced(recording, images, cameras(3))
+
+
+def test_the_common_clock_agrees_over_devices_within_their_jitter() -> None:
+    recording, _ = record(array_of(8), count=60)
+    ledger = recording.ledger
+    for k in range(60):
+        times = [ledger.entry(k, name).t_ns - recording.train.time_ns(k) for name in ledger.devices]
+        assert max(map(abs, times)) < 6000  # 6 sigma of a reading
+
+
+def test_drift_is_measured() -> None:
+    array = array_of(3)
+    recording, _ = record(array, count=150)
+    for device in array.devices:
+        true = device._settings.clock.drift_ppm  # type: ignore[attr-defined]
+        assert abs(recording.clocks[device.info.name].drift_ppm - true) < 1.0
+
+
+INFO = DeviceInfo(
+    name="cam00", serial="1", model="m", layout=ImageLayout(4, 4, 1, "uint8"), id_bits=16,
+    triggers=(TriggerKind.HARDWARE,),
+)  # fmt: skip
+
+
+def collated(rows: list[tuple[int, float, float]], count: int = 10) -> Collator:
+    """A device's frames: number, device time in periods, arrival in periods."""
+    collator = Collator([INFO], TriggerTrain(0, 1000, count, PRE), {"cam00": ClockModel(0, 0)})
+    for frame_id, t_dev, t_host in rows:
+        collator.add(FrameEvent("cam00", frame_id, round(1000 * t_dev), round(1000 * t_host), 0))
+    return collator
+
+
+def test_a_device_that_restarts_numbers_and_clock_is_taken_up_again() -> None:
+    before = [(100 + k, k, k + 0.5) for k in range(3)]
+    after = [(1 + k, 0.3 + k - 1000, 5 + k + 0.5) for k in range(5)]  # triggers 5 to 9
+    ledger = collated(before + after).close()
+    assert verdicts(ledger, "cam00") == {3: "lost", 4: "lost"}
+    assert [r.oddity for r in ledger.remarks] == [Oddity.CLOCK_STEP, Oddity.ID_RESET]
+
+
+def test_a_lost_frame_that_comes_late_is_stale() -> None:
+    rows = [(1, 0, 0.5), (3, 2, 2.5), (2, 1, 2.6), (4, 3, 3.5)]
+    ledger = collated(rows, count=4).close()
+    assert verdicts(ledger, "cam00") == {1: "lost"}
+    assert [r.oddity for r in ledger.remarks] == [Oddity.STALE]
+
+
+def test_a_clock_that_steps_before_the_first_frame_is_found_out_by_the_arrival() -> None:
+    for step in (-7.0, 0.4, 25.0, 1e6):
+        ledger = collated([(1 + k, k + step, k + 0.5) for k in range(10)]).close()
+        assert verdicts(ledger, "cam00") == {}
+        assert [r.oddity for r in ledger.remarks] == [Oddity.CLOCK_STEP]
+
+
+def test_a_stalled_host_does_not_make_missed_triggers_into_a_clock_step() -> None:
+    rows = [(1, 0, 0.5), (2, 1, 1.5), (3, 2, 6.4), (4, 5, 6.5), (5, 6, 6.6), (6, 7, 7.5)]
+    rows += [(7, 8, 8.5), (8, 9, 9.5)]
+    ledger = collated(rows).close()
+    assert verdicts(ledger, "cam00") == {3: "missed_trigger", 4: "missed_trigger"}
+    assert ledger.remarks == ()
+
+
+def test_a_number_given_twice_is_quarantined() -> None:
+    rows = [(1, 0, 0.5), (2, 1, 1.5), (2, 2, 2.5), (3, 3, 3.5)]
+    ledger = collated(rows, count=4).close()
+    assert verdicts(ledger, "cam00") == {2: "quarantined"}
+    assert [r.oddity for r in ledger.remarks] == [Oddity.DUPLICATE]
+
+
+def test_some_lost_and_some_missed_is_counted_and_said() -> None:
+    ledger = collated([(1, 0, 0.5), (3, 4, 4.5)], count=5).close()
+    assert verdicts(ledger, "cam00") == {1: "lost", 2: "missed_trigger", 3: "missed_trigger"}
+    assert ledger.entry(1, "cam00").note == "lost and missed in an unknown order"
+
+
+def test_pre_roll_and_post_roll_are_placed_and_not_wanted() -> None:
+    collator = collated([])
+    places = [
+        collator.add(FrameEvent("cam00", k + 2, 1000 * k, 1000 * k + 500, 0))
+        for k in (-1, 0, 9, 10)
+    ]
+    assert [(p.trigger_index, p.wanted) for p in places] == [
+        (-1, False), (0, True), (9, True), (10, False),
+    ]  # fmt: skip
+
+
+def test_a_train_without_triggers_is_refused() -> None:
+    with pytest.raises(SettingsError, match="found 1000 ns, 0"):
+        TriggerTrain(0, 1000, 0)

@@ -69,9 +69,7 @@ def search_flow(
         window_weights(half),
     )  # fmt: skip
     blank = np.zeros((len(displacement), 3))
-    return FlowMatches(
-        displacement=displacement, correlation=correlation, information=blank
-    )
+    return FlowMatches(displacement=displacement, correlation=correlation, information=blank)
 
 
 def refine_flow(
@@ -98,9 +96,7 @@ def refine_flow(
         (level.image, level.gradient), (view.image, view.solid), level.centres, level.windows,
         start, iterations, window_weights(half),
     )  # fmt: skip
-    return FlowMatches(
-        displacement=displacement, correlation=correlation, information=information
-    )
+    return FlowMatches(displacement=displacement, correlation=correlation, information=information)
 
 
 @numba.njit(cache=True, parallel=True)
@@ -309,9 +305,7 @@ def _hessian(patch: Any) -> tuple[float, float, float]:
 
 
 @numba.njit(cache=True)
-def _shifted(
-    image: Any, x0: int, y0: int, dx: float, dy: float, lines: Any, values: Any
-) -> bool:
+def _shifted(image: Any, x0: int, y0: int, dx: float, dy: float, lines: Any, values: Any) -> bool:
     """The window of `image` at a fractional shift, Catmull-Rom; False outside the image."""
     height, width = image.shape
     side = values.shape[0]
@@ -337,7 +331,10 @@ def _shifted(
     for j in range(side):
         for i in range(side):
             values[j, i] = (
-                a0 * lines[j, i] + a1 * lines[j + 1, i] + a2 * lines[j + 2, i] + a3 * lines[j + 3, i]
+                a0 * lines[j, i]
+                + a1 * lines[j + 1, i]
+                + a2 * lines[j + 2, i]
+                + a3 * lines[j + 3, i]
             )
     return True
 

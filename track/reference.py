@@ -114,9 +114,7 @@ def reference_level(
     centres = np.rint(pixels).astype(np.int32)
     right, down = _joints(buffers.triangle, triangles, rings.indptr, rings.indices)
     windows = _flood(centres, right, down, half)
-    _drop_strangers(
-        windows, centres, buffers.triangle, triangles, own, rings.indptr, rings.indices
-    )
+    _drop_strangers(windows, centres, buffers.triangle, triangles, own, rings.indptr, rings.indices)
     rows, columns = np.gradient(image)
     return ReferenceLevel(
         camera=camera,

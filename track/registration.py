@@ -72,6 +72,19 @@ class FrameResult:
     residual_px: float
     views: float
 
+    @classmethod
+    def lost(cls, vertices: Floats) -> FrameResult:
+        """A frame that could not be measured: the prediction, with confidence 0."""
+        blank = np.zeros(len(vertices))
+        return cls(
+            vertices=vertices,
+            confidence=blank,
+            samples=0,
+            correlation=0.0,
+            residual_px=0.0,
+            views=0.0,
+        )
+
 
 class Registrar:
     """Registers frames of one take to its neutral.
@@ -165,9 +178,7 @@ class Registrar:
             pixels = small.project(self._samples.points(self._neutral)[chosen])
             surface = (self._triangles, self._samples.triangle[chosen], self._rings)
             half = self._options.half_window if level == 0 else self._options.half_window_coarse
-            out.append(
-                reference_level(small, picture, buffers, pixels, chosen, surface, half)
-            )
+            out.append(reference_level(small, picture, buffers, pixels, chosen, surface, half))
         return out
 
     def _depth(self, name: str, vertices: Floats) -> tuple[Floats32, float]:
@@ -335,9 +346,11 @@ def _slopes(place: Floats32, centres: Ints32) -> Floats:
         known = np.isfinite(both).all(axis=2)
         total = np.where(known[..., None], both, 0.0).sum(axis=0)
         count = known.sum(axis=0)
-        out[:, :, axis] = np.where(count[:, None] > 0, total / np.maximum(count, 1)[:, None], np.nan)
-    flat = np.abs(np.linalg.det(np.nan_to_num(out))) < 0.05  # folded or turned away
-    out[flat] = np.nan
+        mean = total / np.maximum(count, 1)[:, None]
+        out[:, :, axis] = np.where(count[:, None] > 0, mean, np.nan)
+    area: Floats = out[:, 0, 0] * out[:, 1, 1] - out[:, 0, 1] * out[:, 1, 0]
+    folded: Bools = np.less(np.abs(np.nan_to_num(area)), 0.05)  # or turned away
+    out[folded] = np.nan
     return out
 
 
@@ -358,6 +371,7 @@ def _neighbour_matrix(
 def _agreement(neighbours: sparse.csr_matrix, motion: Floats, weights: Floats) -> Floats:
     """Weights (N,) 0..1 that fall where a sample moves otherwise than its neighbours."""
     trust = weights.copy()
+    factor: Floats = np.ones(len(weights))
     for _ in range(2):
         total = neighbours @ trust
         mean = (neighbours @ (trust[:, None] * motion)) / np.maximum(total, 1e-9)[:, None]
@@ -374,7 +388,9 @@ def _typical(values: Floats) -> float:
     return float(np.median(positive)) if len(positive) else 1.0
 
 
-def schedule(levels: int, search_px: int, passes: int, bending_mm: Sequence[float]) -> tuple[Step, ...]:
+def schedule(
+    levels: int, search_px: float, passes: int, bending_mm: Sequence[float]
+) -> tuple[Step, ...]:
     """The steps of a frame: search at the coarsest level, refine at the others.
 
     Args:

@@ -1,0 +1,363 @@
+"""The tracking stage: the neutral mesh through every frame of a take.
+
+::
+
+    TAKE/products/track/performance.npz      the product
+    TAKE/products/track/report.json          figures by frame
+    TAKE/products/track/frames/*.npz         finished frames, kept so that work can be resumed
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from capture.archive import read_archive, write_archive
+from capture.arrays import Bools, Floats, Floats32
+from capture.camera import CameraArray
+from capture.errors import ShapeError, TakeError
+from capture.product import is_current, replacing, stage_record, write_record
+from capture.progress import Progress, silent
+from capture.settings import check_range
+from capture.take import Take
+from recon.images import mono
+from recon.mesh import Mesh
+from track.head_motion import damped_motion, head_motion
+from track.performance import Performance, read_performance, write_performance
+from track.pyramid import level_count
+from track.registration import FrameResult, Registrar, RegistrarOptions, schedule
+
+_FIGURES = ("samples", "correlation", "residual_px", "views", "seconds")
+_MIN_VIEWS = 2
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackSettings:
+    """Settings of the tracking stage.
+
+    Attributes:
+        spacing_mm: triangles wider than this get samples inside; every vertex is one anyway.
+        search_mm: how far skin may move from one frame to the next beyond the head's motion.
+        passes: rounds of guide, match, lift and solve at full resolution.
+        half_window_px: matching windows have 2 half + 1 px a side at full resolution.
+        half_window_coarse_px: the same at the coarser pyramid levels.
+        bending_coarse_mm: stiffness of the first round; bumps shorter than about six times this
+            are left for later rounds.
+        bending_mm: stiffness of the last round.
+        min_cosine: least cosine between the skin's normal and the view.
+        min_correlation: least correlation of a match.
+        search_stride: in the first round every how manieth sample is matched.
+        rotation_iterations: updates of the local frames in each solve.
+        extrapolation: share of the head's last motion expected again.
+    """
+
+    spacing_mm: float = 6.0
+    search_mm: float = 7.0
+    passes: int = 2
+    half_window_px: int = 7
+    half_window_coarse_px: int = 5
+    bending_coarse_mm: float = 8.0
+    bending_mm: float = 1.5
+    min_cosine: float = 0.35
+    min_correlation: float = 0.5
+    search_stride: int = 3
+    rotation_iterations: int = 2
+    extrapolation: float = 0.7
+
+    def __post_init__(self) -> None:
+        ranges = {
+            "spacing_mm": (0.2, 100.0), "search_mm": (0.1, 50.0), "passes": (1, 10),
+            "half_window_px": (3, 20), "half_window_coarse_px": (3, 20),
+            "bending_coarse_mm": (0.05, 100.0), "bending_mm": (0.05, 100.0),
+            "min_cosine": (0.05, 0.95), "min_correlation": (0.0, 0.99), "search_stride": (1, 100),
+            "rotation_iterations": (1, 10), "extrapolation": (0.0, 1.0),
+        }  # fmt: skip
+        for name, (low, high) in ranges.items():
+            check_range(f"track.{name}", getattr(self, name), low, high)
+
+
+def track(
+    take: Take,
+    neutral: Mesh,
+    settings: TrackSettings,
+    *,
+    landmarks: Path | None = None,
+    progress: Progress = silent,
+) -> Performance:
+    """Track a mesh, registered to the first frame, through all frames of a take.
+
+    Every frame is matched to the first one, so that errors do not add up; the frame before it
+    only says where to look. Finished frames are kept in TAKE/products/track/frames and used again
+    while take, neutral, settings and code are the same.
+
+    Args:
+        take: it needs cameras.
+        neutral: world mm, on the skin at the first frame; any topology.
+        settings: see `TrackSettings`.
+        landmarks: hand landmarks; the registered neutral makes them unnecessary here. The file
+            must be JSON; nothing else is done with it.
+        progress: told after each frame.
+
+    Returns:
+        What TAKE/products/track/performance.npz holds. `head_from_neutral` is measured on the
+        skin that moves least; `reference` is -1 throughout.
+
+    Raises:
+        CameraError: when the take has no cameras, or they do not fit.
+        TakeError: when the take has no frames, too few views of the first one, or no view sees
+            the neutral; or when the landmarks cannot be read.
+        SolveError: when a solve does not reach an answer.
+    """
+    out = take.products / "track" / "performance.npz"
+    record = _record(take, neutral, settings, landmarks)
+    if is_current(out, record):
+        return read_performance(out)
+    cameras = take.cameras()
+    frames = _frames(take)
+    shelf = _FrameShelf(out.parent / "frames", record)
+    work = _Work(take, neutral, cameras, settings)
+    results = [work.reference(frames[0])]
+    progress(1, len(frames), "track")
+    for done, frame in enumerate(frames[1:], start=2):
+        found = shelf.load(frame, len(neutral.vertices))
+        if found is None:
+            found = work.follow(frame, results)
+            shelf.save(frame, found)
+        results.append(found)
+        progress(done, len(frames), "track")
+    performance, report = _assemble(neutral, frames, results)
+    write_performance(out, performance)
+    with replacing(out.with_name("report.json")) as partial:
+        partial.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    write_record(out, record)
+    return performance
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Tracked:
+    """One finished frame: arrays as stored (float32), figures by name."""
+
+    vertices: Floats32
+    confidence: Floats32
+    figures: Mapping[str, float]
+
+
+class _FrameShelf:
+    """Finished frames on disk, valid for one record."""
+
+    def __init__(self, folder: Path, record: Mapping[str, Any]) -> None:
+        self._folder, self._record = folder, record
+
+    def load(self, frame: int, vertex_count: int) -> _Tracked | None:
+        """The stored frame, or None when there is none that was made this way."""
+        path = self._path(frame)
+        if not is_current(path, self._record):
+            return None
+        try:
+            held = read_archive(path, required=("vertices", "confidence", "figures"))
+        except ShapeError:
+            return None  # damaged: made again
+        if held["vertices"].shape != (vertex_count, 3):
+            return None
+        return _Tracked(
+            vertices=held["vertices"],
+            confidence=held["confidence"],
+            figures=dict(zip(_FIGURES, held["figures"].tolist(), strict=True)),
+        )
+
+    def save(self, frame: int, tracked: _Tracked) -> None:
+        """Store a frame, whole or not at all."""
+        path = self._path(frame)
+        figures = np.array([tracked.figures[name] for name in _FIGURES])
+        write_archive(
+            path,
+            {"vertices": tracked.vertices, "confidence": tracked.confidence, "figures": figures},
+        )
+        write_record(path, self._record)
+
+    def _path(self, frame: int) -> Path:
+        return self._folder / f"frame_{frame:04d}.npz"
+
+
+class _Work:
+    """The registrar of a take, made when a frame is first asked for."""
+
+    def __init__(
+        self, take: Take, neutral: Mesh, cameras: CameraArray, settings: TrackSettings
+    ) -> None:
+        self._take, self._neutral, self._settings = take, neutral, settings
+        self._cameras = cameras
+        self._registrar: Registrar | None = None
+
+    def reference(self, frame: int) -> _Tracked:
+        """The first frame: the neutral itself."""
+        began = time.perf_counter()
+        registrar = self._made()
+        confidence = registrar.vertex_views()
+        if not confidence.any():
+            names = ", ".join(self._cameras.names)
+            raise TakeError(
+                f"{self._take.folder}: no two views see the neutral at frame {frame}; its vertices "
+                f"lie about {np.round(self._neutral.vertices.mean(axis=0), 1).tolist()} mm; is it "
+                f"in world millimetres of the cameras {names}?"
+            )
+        seen = registrar.views_of_samples
+        figures = {
+            "samples": float((seen >= _MIN_VIEWS).sum()),
+            "correlation": 1.0,
+            "residual_px": 0.0,
+            "views": float(seen[seen >= _MIN_VIEWS].mean()),
+            "seconds": time.perf_counter() - began,
+        }
+        return _Tracked(
+            vertices=self._neutral.vertices.astype(np.float32),
+            confidence=confidence.astype(np.float32),
+            figures=figures,
+        )
+
+    def follow(self, frame: int, before: list[_Tracked]) -> _Tracked:
+        """Register one frame, beginning where the last ones lead."""
+        began = time.perf_counter()
+        start = self._predict(before)
+        images = self._images(frame)
+        if len(images) < _MIN_VIEWS:
+            result = FrameResult.lost(start)
+        else:
+            result = self._made().register(start, images)
+        figures = {
+            "samples": float(result.samples),
+            "correlation": result.correlation,
+            "residual_px": result.residual_px,
+            "views": result.views,
+            "seconds": time.perf_counter() - began,
+        }
+        return _Tracked(
+            vertices=result.vertices.astype(np.float32),
+            confidence=result.confidence.astype(np.float32),
+            figures=figures,
+        )
+
+    def _predict(self, before: list[_Tracked]) -> Floats:
+        last = before[-1].vertices.astype(np.float64)
+        if len(before) < 2 or self._settings.extrapolation == 0.0:
+            return last
+        weights = (before[-1].confidence * before[-2].confidence).astype(np.float64)
+        if (weights > 0).sum() < 100:
+            return last
+        earlier = before[-2].vertices.astype(np.float64)
+        return damped_motion(earlier, last, weights, self._settings.extrapolation).apply(last)
+
+    def _made(self) -> Registrar:
+        if self._registrar is None:
+            first = self._take.frames[0]
+            images = self._images(first)
+            if len(images) < _MIN_VIEWS:
+                raise TakeError(
+                    f"{self._take.folder}: frame {first} has {len(images)} of "
+                    f"{len(self._cameras)} views; the reference needs at least {_MIN_VIEWS}"
+                )
+            self._registrar = Registrar(
+                self._neutral.vertices,
+                self._neutral.triangles,
+                {camera.name: camera for camera in self._cameras},
+                images,
+                _options(self._settings, self._cameras, self._neutral),
+            )
+        return self._registrar
+
+    def _images(self, frame: int) -> dict[str, Floats32]:
+        take = self._take
+        names = [name for name in take.device_names if take.present(name, frame)]
+        return {name: mono(take.image(name, frame)) for name in names}
+
+
+def _options(settings: TrackSettings, cameras: CameraArray, neutral: Mesh) -> RegistrarOptions:
+    centre = neutral.vertices.mean(axis=0)[None]
+    scales = [camera.fx / abs(float(camera.depths(centre)[0])) for camera in cameras]
+    px_per_mm = float(np.median(scales))
+    levels = min(level_count(camera.width, camera.height) for camera in cameras)
+    bending = (settings.bending_coarse_mm, settings.bending_mm)
+    return RegistrarOptions(
+        steps=schedule(levels, settings.search_mm * px_per_mm, settings.passes, bending),
+        spacing_mm=settings.spacing_mm,
+        half_window=settings.half_window_px,
+        half_window_coarse=settings.half_window_coarse_px,
+        min_cosine=settings.min_cosine,
+        min_correlation=settings.min_correlation,
+        search_stride=settings.search_stride,
+        rotation_iterations=settings.rotation_iterations,
+    )
+
+
+def _frames(take: Take) -> tuple[int, ...]:
+    if not take.frames:
+        raise TakeError(f"{take.folder}: the take has no frames")
+    return take.frames
+
+
+def _record(
+    take: Take, neutral: Mesh, settings: TrackSettings, landmarks: Path | None
+) -> dict[str, Any]:
+    shape = hashlib.sha256(neutral.vertices.tobytes() + neutral.polygons.tobytes()).hexdigest()
+    inputs = {"take": take.input_hash(), "neutral": shape}
+    if landmarks is not None:
+        try:
+            text = Path(landmarks).read_text(encoding="utf-8")
+            json.loads(text)
+        except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+            raise TakeError(f"{landmarks}: expected landmarks as JSON: {error}") from error
+        inputs["landmarks"] = hashlib.sha256(text.encode()).hexdigest()
+    return stage_record("track", settings, inputs)
+
+
+def _assemble(
+    neutral: Mesh, frames: tuple[int, ...], results: list[_Tracked]
+) -> tuple[Performance, dict[str, Any]]:
+    vertices = np.stack([result.vertices for result in results])
+    confidence = np.stack([result.confidence for result in results])
+    counted: Bools = np.greater(confidence.max(axis=1), 0.0)  # lost frames have no say
+    head = head_motion(
+        neutral.vertices,
+        vertices[counted].astype(np.float64),
+        confidence[counted].astype(np.float64),
+    )
+    motions = _carried(head.head_from_neutral, counted)
+    performance = Performance(
+        vertices=vertices,
+        confidence=confidence,
+        polygons=neutral.polygons,
+        frames=np.array(frames, dtype=np.int64),
+        head_from_neutral=motions,
+        reference=np.full(len(frames), -1, dtype=np.int64),
+    )
+    rows = [
+        {
+            "frame": int(frame),
+            **{name: round(float(value), 5) for name, value in result.figures.items()},
+            "mean_confidence": round(float(result.confidence.mean()), 4),
+            "head_from_neutral": np.round(motion, 6).tolist(),
+            "lost": not bool(result.confidence.any()),
+        }
+        for frame, result, motion in zip(frames, results, motions, strict=True)
+    ]
+    report = {
+        "frames": rows,
+        "rigid_vertices": int((head.rigid_weights > 0.25).sum()),
+        "rigid_spread_mm": round(float(np.median(head.spread_mm[head.rigid_weights > 0.25])), 4),
+    }
+    return performance, report
+
+
+def _carried(motions: Floats, counted: Bools) -> Floats:
+    """Motions of all frames: a lost frame has that of the last frame that is not."""
+    place = np.maximum.accumulate(np.where(counted, np.arange(len(counted)), 0))
+    row = np.cumsum(counted) - 1
+    carried: Floats = motions[row[place]]
+    return carried

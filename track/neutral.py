@@ -54,14 +54,14 @@ class NeutralSettings:
         landmark_last_share: the same, at last.
     """
 
-    steps: int = 16
-    bending_first_mm: float = 40.0
+    steps: int = 20
+    bending_first_mm: float = 100.0
     bending_last_mm: float = 2.5
     reach_first_mm: float = 25.0
     reach_last_mm: float = 3.0
     angle_first_deg: float = 60.0
     angle_last_deg: float = 30.0
-    normal_first_mm: float = 30.0
+    normal_first_mm: float = 60.0
     normal_last_mm: float = 12.0
     landmark_first_share: float = 1.0
     landmark_last_share: float = 0.02

@@ -1,0 +1,99 @@
+"""Neutral registration of the ICT mean head to other identities, against placement alone.
+
+Example: python -m tools.bench.bench_neutral --seeds 3 11 12 --noise-mm 0.05
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+
+import numpy as np
+
+from capture.arrays import Floats
+from recon.mesh import Mesh, vertex_normals
+from recon.surface import closest_points
+from tools.bench.neutral_scene import arc_cameras, misplaced, scan_of
+from track.neutral import NeutralSettings, fit_template
+from track.rigid import Similarity
+
+_ICT = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "ict" / "ict_light.npz"
+_HEAD, _FACE, _SURFACE = (
+    11248,
+    6706,
+    24591,
+)  # vertices: head and neck, narrow face, all but eyes' wet
+
+
+def ict_actor(seed: int, strength: float = 0.8) -> Floats:
+    """The vertices of a random ICT identity, mm, as the take renderer of ../shared draws them."""
+    with np.load(_ICT) as data:
+        rng = np.random.default_rng(seed)
+        weights = rng.normal(0.0, strength, 100) * np.exp(-np.arange(100) / 25.0)
+        actor: Floats = 10.0 * (data["neutral"] + np.einsum("k,kij->ij", weights, data["identity"]))
+    return actor
+
+
+def ict_template() -> tuple[Mesh, np.ndarray[tuple[int, ...], np.dtype[np.int32]]]:
+    """The mean head, quads, mm; and the triangles of the whole model but its outer eyes."""
+    with np.load(_ICT) as data:
+        triangles = data["tri"]
+        whole = triangles[(triangles < _SURFACE).all(axis=1)].astype(np.int32)
+        return Mesh(10.0 * data["neutral"][:_HEAD], data["quads"][:11144]), whole
+
+
+def measure(seed: int, noise_mm: float, angle_deg: float) -> dict[str, float]:
+    """Errors of one identity, mm: correspondence over the face, surface over what is seen of it."""
+    template, whole = ict_template()
+    actor = ict_actor(seed)
+    cameras = arc_cameras(actor[:9409].mean(axis=0))
+    scan = scan_of((actor, whole), cameras, noise_mm=noise_mm, seed=seed)
+    start = misplaced(template, seed, angle_deg=angle_deg)
+    begin = time.process_time()
+    mesh, report, fit = fit_template(start, scan, cameras, NeutralSettings())
+    seconds = time.process_time() - begin
+    placed = np.array(report["world_from_template"])
+    motion = Similarity(rotation=placed[:3, :3], translation=placed[:3, 3])
+    only = motion.apply(start.vertices)
+    gap = _gap(mesh.vertices, actor)
+    _, _, surface = closest_points(actor, whole, mesh.vertices[:_FACE][fit.seen[:_FACE]])
+    normals = vertex_normals(actor[:_HEAD], template.triangles)[:_FACE]
+    along = np.einsum("vx,vx->v", mesh.vertices[:_FACE] - actor[:_FACE], normals)
+    return {
+        "placed": float(np.median(_gap(only, actor))),
+        "corr": float(np.median(gap)),
+        "corr95": float(np.quantile(gap, 0.95)),
+        "tangent": float(np.median(np.sqrt(np.maximum(gap**2 - along**2, 0.0)))),
+        "surf": float(np.median(surface)),
+        "surf95": float(np.quantile(surface, 0.95)),
+        "cpu_s": seconds,
+    }
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[3, 11, 12])
+    parser.add_argument("--noise-mm", type=float, default=0.0)
+    parser.add_argument("--angle-deg", type=float, default=20.0)
+    options = parser.parse_args()
+    rows: list[dict[str, float]] = []
+    for seed in options.seeds:
+        row = measure(seed, options.noise_mm, options.angle_deg)
+        if not rows:
+            print("seed  " + "  ".join(f"{name:>8}" for name in row))
+        print(f"{seed:4d}  " + "  ".join(f"{value:8.3f}" for value in row.values()), flush=True)
+        rows.append(row)
+    middle = {name: float(np.median([row[name] for row in rows])) for name in rows[0]}
+    print(f"{'mid':>4}  " + "  ".join(f"{value:8.3f}" for value in middle.values()))
+    print(f"correspondence against placement alone: {middle['corr'] / middle['placed']:.2f}")
+
+
+def _gap(vertices: Floats, actor: Floats) -> Floats:
+    gap: Floats = np.linalg.norm(vertices[:_FACE] - actor[:_FACE], axis=1)
+    return gap
+
+
+if __name__ == "__main__":
+    main()

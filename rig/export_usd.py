@@ -13,7 +13,6 @@ import numpy as np
 from capture.arrays import Floats, Floats32, Ints32
 from capture.errors import ExtraError, WorkError
 from capture.product import replacing
-from recon.mesh import Mesh
 from rig.exchange import polygon_corners, single, sparse_rows
 from rig.face_rig import FaceRig
 from rig.quaternion import quaternions
@@ -29,7 +28,8 @@ def write_usd_rig(path: Path, rig: FaceRig, fps: float) -> None:
     """Write a rig as one SkelRoot: mesh, sparse blend shapes, and one joint that carries the head.
 
     Names that USD does not accept as prim names are bent; `skel:blendShapes` keeps the true ones.
-    The file is in millimetres (`metersPerUnit` 0.001), +Y up; time code f is frame f.
+    The file is in millimetres (`metersPerUnit` 0.001), +Y up; time code f is frame f. The mesh is a
+    Catmull-Clark cage, whose normals follow from its points, so none are written.
 
     Args:
         path: `.usdc` (binary) or `.usda` (text), written or replaced.
@@ -151,8 +151,6 @@ def _skeleton(skeleton: Any) -> None:
 def _blend_shapes(stage: Usd.Stage, rig: FaceRig) -> list[Any]:
     from pxr import Tf, UsdSkel, Vt
 
-    mesh = Mesh(rig.neutral, rig.polygons)
-    rest = _normals(mesh, rig.neutral)
     paths: list[Any] = []
     taken: set[str] = set()
     for name, delta in zip(rig.names, rig.deltas, strict=True):
@@ -162,9 +160,7 @@ def _blend_shapes(stage: Usd.Stage, rig: FaceRig) -> list[Any]:
         taken.add(valid)
         shape = UsdSkel.BlendShape.Define(stage, f"/Head/Mesh/{valid}")
         moved, rows = sparse_rows(single(delta))
-        turned = (_normals(mesh, rig.neutral + delta) - rest)[moved]
         shape.CreateOffsetsAttr(_vectors(rows))
-        shape.CreateNormalOffsetsAttr(_vectors(turned))
         shape.CreatePointIndicesAttr(Vt.IntArray.FromNumpy(moved))
         paths.append(shape.GetPath())
     return paths
@@ -189,11 +185,6 @@ def _animation(animation: Any, rig: FaceRig, names: list[str]) -> None:
         translations.Set(_vectors(matrix[None, :3, 3]), time)
         rotations.Set(Vt.QuatfArray([Gf.Quatf(w, Gf.Vec3f(x, y, z))]), time)
         weights.Set(Vt.FloatArray.FromNumpy(single(row)), time)
-
-
-def _normals(mesh: Mesh, vertices: Floats) -> Floats32:
-    normals = mesh.with_vertices(vertices).normals()
-    return np.nan_to_num(normals).astype(np.float32)
 
 
 def _extent(vertices: Floats32) -> Floats32:

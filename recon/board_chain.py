@@ -168,7 +168,8 @@ def _one_device_fit(
     plausible = _FOCAL_RANGE[0] <= focal / size <= _FOCAL_RANGE[1] and abs(k1) < 2.0
     if not plausible or rms > _ROUGH_FIT_PX * max(1.0, size / _REFERENCE_PX):
         return float("nan"), 0.0
-    return focal, k1
+    # OpenCV sums residuals in the order its threads finish: the last digits do not repeat.
+    return round(focal, 2), round(k1, 4)
 
 
 def _pose_candidates(

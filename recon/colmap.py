@@ -91,6 +91,8 @@ def adjust_array(
     References:
         Triggs et al. 2000, Bundle Adjustment - A Modern Synthesis; COLMAP's rigs and frames.
     """
+    seen = np.bincount(observations.corner, minlength=len(state.corners))
+    observations = observations.select(seen[observations.corner] > 1)  # COLMAP wants tracks
     with _vendor("bundle adjustment"):
         problem = _build(state, observations)
         config = _config(problem, observations, state.corners, options)

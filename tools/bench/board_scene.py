@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -181,6 +182,7 @@ def render_board(
     return seen
 
 
+@lru_cache(maxsize=2)
 def _ideal_grid(camera: Camera) -> Floats:
     """Ideal places (H', W', 2) of samples finer than pixels, linear between every fourth pixel."""
     columns = np.arange(-4.0, camera.width + 8.0, 4.0)

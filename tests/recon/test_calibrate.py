@@ -118,7 +118,7 @@ def test_devices_of_unequal_size_are_solved_together() -> None:
 
 
 def test_a_rigid_move_of_the_truth_changes_nothing() -> None:
-    """The world comes from the array itself, so the solution does not know where the truth stood."""
+    """The world comes from the array itself, not from where the truth stood."""
     _, solution = solved(SMALL)
     state = solution.state
     turned = state.moved(
@@ -134,12 +134,8 @@ def test_a_rigid_move_of_the_truth_changes_nothing() -> None:
 def test_the_world_stands_upright_before_the_face() -> None:
     truth, solution = solved(SMALL)
     cameras = solution.state.cameras
-    assert (
-        np.linalg.norm(
-            [c.centre - t.centre for c, t in zip(cameras, truth, strict=True)], axis=1
-        ).max()
-        < 60
-    )
+    apart = [c.centre - t.centre for c, t in zip(cameras, truth, strict=True)]
+    assert np.linalg.norm(apart, axis=1).max() < 90.0  # mm: the axes meet near the true origin
     directions = np.stack([camera.centre for camera in cameras])
     mean = directions.mean(axis=0)
     np.testing.assert_allclose(mean[:2] / mean[2], 0.0, atol=1e-9)
@@ -248,11 +244,13 @@ def test_the_stage_writes_cameras_report_and_record_once(tmp_path: Path) -> None
     calibrate(take, A4_BOARD, settings, out, progress=lambda done, total, what: steps.append(what))
     assert steps == []  # current: skipped
     assert (out.read_bytes(), out.stat().st_mtime_ns) == before
-    with pytest.raises(TakeError, match="at least 5"):
+    with pytest.raises(
+        TakeError, match=r"cam00: used the board in 4 frames .* \(4 used, 3 no board\)"
+    ):
         calibrate(
             take,
             A4_BOARD,
-            dataclasses.replace(settings, least_views=7, least_poses=5),
+            dataclasses.replace(settings, least_views=7),
             tmp_path / "no.json",
         )
     assert not (tmp_path / "no.json").exists()

@@ -58,10 +58,10 @@ def test_sixteen_bits_and_colour_see_the_same(frontal: Image) -> None:
 def test_the_edge_spread_grows_with_the_blur(frontal: Image) -> None:
     sharp = detect_corners(frontal, A4_BOARD).blur_px
     soft = detect_corners(cv2.GaussianBlur(frontal, (0, 0), 2.0), A4_BOARD).blur_px
-    smear = detect_corners(cv2.blur(frontal, (9, 1)), A4_BOARD).blur_px  # motion along a row
+    smear = detect_corners(cv2.blur(frontal, (5, 1)), A4_BOARD).blur_px  # motion along a row
     assert 0.5 < sharp < 1.6
     assert 1.8 < soft < 3.2
-    assert smear > 1.5 * sharp
+    assert smear > 1.3 * sharp
 
 
 def test_bad_views_are_refused_by_reason(frontal: Image) -> None:

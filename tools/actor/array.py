@@ -61,3 +61,25 @@ def _look(place: Floats, target: Floats, roll: float) -> Pose:
     upright = np.stack([right, np.cross(forward, right), forward])
     turned = Pose.from_rotation_vector(np.array([0.0, 0.0, roll]), np.zeros(3)).rotation @ upright
     return Pose(turned, -turned @ place)
+
+
+def camera_at(
+    target: Floats, azimuth_deg: float, elevation_deg: float, size: int, zoom: float = 1.0
+) -> Camera:
+    """One camera of a plain lens that looks at a place from a direction, for pictures.
+
+    Args:
+        target: (3,) world, mm.
+        azimuth_deg: 0 before the face, growing to the actor's left.
+        elevation_deg: above the horizon.
+        size: columns and rows, px.
+        zoom: of the focal length; 1 shows the whole head.
+    """
+    azimuth, elevation = np.radians([azimuth_deg, elevation_deg])
+    away = np.array([np.sin(azimuth) * np.cos(elevation), np.sin(elevation),
+                     np.cos(azimuth) * np.cos(elevation)])  # fmt: skip
+    focal, centre = _FOCAL * size * zoom, 0.5 * (size - 1)
+    return Camera(
+        name="view", width=size, height=size, fx=focal, fy=focal, cx=centre, cy=centre,
+        distortion=np.zeros(5), camera_from_world=_look(target + _RADIUS_MM * away, target, 0.0),
+    )  # fmt: skip

@@ -40,8 +40,13 @@ class BoardRenderer:
         drawn = board.pattern().generateImage((wide, high), marginSize=0, borderBits=1)
         image = np.pad(np.asarray(drawn, np.uint8), margin, constant_values=255)
         edge = _MARGIN_SQUARES * board.square_mm
-        right, down = board.squares_x * board.square_mm + edge, board.squares_y * board.square_mm + edge
-        self._corners = np.array([[-edge, -edge, 0], [right, -edge, 0], [-edge, down, 0], [right, down, 0]])
+        right, down = (
+            board.squares_x * board.square_mm + edge,
+            board.squares_y * board.square_mm + edge,
+        )
+        self._corners = np.array(
+            [[-edge, -edge, 0], [right, -edge, 0], [-edge, down, 0], [right, down, 0]]
+        )
         texels = np.array([[0, 0], [1, 0], [0, 1], [1, 1]], np.float32)
         with self.canvas.context as context:
             self._program: Any = context.program(vertex_shader=_VERTEX, fragment_shader=_FRAGMENT)

@@ -112,5 +112,7 @@ class Canvas:
             reach = 2 * (self.supersample // 2) + 1
             kernel = cv2.getGaussianKernel(reach, 0.36 * self.supersample, cv2.CV_32F)
             drawn = cv2.sepFilter2D(drawn, cv2.CV_32F, kernel, kernel)
-        bent = cv2.remap(drawn, view.columns, view.rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        bent = cv2.remap(
+            drawn, view.columns, view.rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )
         return np.asarray(bent, dtype=np.float32)

@@ -40,10 +40,14 @@ class Field:
 
     @cached_property
     def normals(self) -> Floats:
-        """(V, 3) of the neutral."""
+        """(V, 3) of the neutral, unit, averaged with their mirror image."""
         polygons = self.lattice.polygons
         triangles = np.concatenate([polygons[:, [0, 1, 2]], polygons[:, [0, 2, 3]]])
-        return vertex_normals(self.points, triangles)
+        normals = vertex_normals(self.points, triangles)
+        normals = normals + normals[self.mirror] * [-1.0, 1.0, 1.0]  # quads split one way only
+        length = np.linalg.norm(normals, axis=1, keepdims=True)
+        unit: Floats = normals / np.maximum(length, 1e-9)
+        return unit
 
     def both_sides(self, name: str, left: Floats) -> dict[str, Floats]:
         """A shape of the left side and its mirror image, under both names."""
@@ -79,14 +83,18 @@ class Interpolator:
         edges = np.unique(np.sort(edges, axis=1), axis=0)
         length = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1)
         weight = 1.0 / np.maximum(length, 0.2)
-        link = sparse.coo_matrix((weight, (edges[:, 0], edges[:, 1])), (self._count, self._count)).tocsr()
+        link = sparse.coo_matrix(
+            (weight, (edges[:, 0], edges[:, 1])), (self._count, self._count)
+        ).tocsr()
         link = link + link.T
         degree = np.asarray(link.sum(axis=1)).ravel()
         laplacian = sparse.diags_array(degree) - link
         inverse = sparse.diags_array(1.0 / np.maximum(degree, 1e-9))
         plate = (laplacian @ inverse @ laplacian).tocsr()
         rows = plate[self._free]
-        self._solver = splu(rows[:, self._free].tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+        self._solver = splu(
+            rows[:, self._free].tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}
+        )
         self._coupling = rows[:, self._held]
 
     def spread(self, values: Floats) -> Floats:

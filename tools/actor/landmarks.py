@@ -7,7 +7,7 @@ import numpy as np
 from capture.arrays import Floats, Ints
 from tools.actor.identity import Identity
 from tools.actor.lattice import Lattice
-from tools.actor.sculpt import EYE_LEVEL, Sculpture, lip_heights, stomion_level
+from tools.actor.sculpt import Sculpture, lip_heights, stomion_level
 
 _SIDE = 0.5
 
@@ -27,14 +27,22 @@ def find_landmarks(lattice: Lattice, sculpture: Sculpture, who: Identity) -> Int
     return np.array(ids + _mouth(lattice, sculpture, who), np.int64)
 
 
-def rigid_vertices(lattice: Lattice, vertices: Floats) -> Ints:
-    """Ids (n,) of the skin on bone: upper forehead, temples, bridge of the nose, behind the ears."""
+def rigid_vertices(lattice: Lattice, vertices: Floats, deltas: Floats) -> Ints:
+    """Ids (n,) of the skin on bone: forehead, temples, bridge of the nose, crown.
+
+    Args:
+        lattice: the topology.
+        vertices: (V, 3) the neutral.
+        deltas: (B, V, 3) shapes; a vertex that one of them moves by 0.5 mm is left out.
+    """
     x, y, z = vertices.T
     forehead = (y > 46) & (z > 20)
     temples = (np.abs(x) > 56) & (y > 18) & (z > -10)
     bridge = (np.abs(x) < 4.5) & (y > 0) & (y < 14) & (z > 60)
     crown = (y > 30) & (z <= 20)
-    return np.flatnonzero((lattice.ring == 0) & (forehead | temples | bridge | crown)).astype(np.int64)
+    still = np.sqrt((deltas**2).sum(axis=2).max(axis=0)) < 0.5
+    on_bone = (lattice.ring == 0) & (forehead | temples | bridge | crown)
+    return np.flatnonzero(on_bone & still).astype(np.int64)
 
 
 def _nearest(lattice: Lattice, vertices: Floats, place: tuple[float, float, float | None]) -> int:
@@ -48,24 +56,24 @@ def _nearest(lattice: Lattice, vertices: Floats, place: tuple[float, float, floa
 
 
 def _jaw() -> list[tuple[float, float, float | None]]:
-    left = [(71.0, 8.0, 5.0), (70.0, -11.0, 6.0), (68.0, -29.0, 8.0), (65.0, -47.0, 10.0),
-            (59.0, -65.0, 16.0), (50.0, -81.0, 28.0), (37.0, -93.0, 46.0), (19.0, -101.0, 68.0)]  # fmt: skip
+    left = [(74.0, 17.5, -4.0), (71.5, -3.5, 2.0), (68.5, -24.0, 6.0), (64.0, -44.0, 9.0),
+            (57.5, -63.5, 16.0), (48.0, -81.0, 30.0), (34.5, -94.0, 49.0), (18.0, -101.0, 69.0)]  # fmt: skip
     right = [(-x, y, z) for x, y, z in left]
-    return [*right, (0.0, -104.0, 82.0), *left[::-1]]
+    return [*right, (0.0, -102.5, 83.0), *left[::-1]]
 
 
 def _brows(who: Identity) -> list[tuple[float, float, float | None]]:
     lift = who.brow_height
-    left = [(11.5, 22.5), (20.5, 26.0), (30.0, 28.5), (40.0, 28.5), (50.0, 23.0)]
+    left = [(11.0, 23.0), (21.0, 27.5), (32.0, 30.5), (43.0, 30.0), (55.0, 23.0)]
     outer_first = [(-x, y + lift, None) for x, y in left[::-1]]
     return [*outer_first, *[(x, y + lift, None) for x, y in left]]
 
 
 def _nose(who: Identity) -> list[tuple[float, float, float | None]]:
     drop = who.nose_length
-    bridge = [(0.0, 10.0, None), (0.0, -2.0, None), (0.0, -14.0, None), (0.0, -26.0 - drop, None)]
+    bridge = [(0.0, 13.0, None), (0.0, 0.0, None), (0.0, -13.0, None), (0.0, -25.0 - drop, None)]
     base = [(x, y - 0.6 * drop, None) for x, y in
-            ((-13.0, -33.5), (-6.5, -36.5), (0.0, -38.0), (6.5, -36.5), (13.0, -33.5))]  # fmt: skip
+            ((-13.0, -33.0), (-6.5, -35.5), (0.0, -37.0), (6.5, -35.5), (13.0, -33.0))]  # fmt: skip
     return [*bridge, *base]
 
 
@@ -78,7 +86,14 @@ def _eye(vertices: Floats, corners: Ints, upper: Ints, lower: Ints, mirrored: bo
         return int(edge[np.argmin(np.abs(vertices[edge, 0] - first - share * span))])
 
     del mirrored
-    return [int(corners[0]), at(upper, 0.32), at(upper, 0.68), int(corners[1]), at(lower, 0.68), at(lower, 0.32)]
+    return [
+        int(corners[0]),
+        at(upper, 0.32),
+        at(upper, 0.68),
+        int(corners[1]),
+        at(lower, 0.68),
+        at(lower, 0.32),
+    ]
 
 
 def _mouth(lattice: Lattice, sculpture: Sculpture, who: Identity) -> list[int]:

@@ -131,7 +131,12 @@ def make_lattice() -> Lattice:
     for row in range(ROWS - 1):
         for column in range(COLUMNS):
             right = (column + 1) % COLUMNS
-            ids = [lower[row, column], grid[row + 1, column], grid[row + 1, right], lower[row, right]]
+            ids = [
+                lower[row, column],
+                grid[row + 1, column],
+                grid[row + 1, right],
+                lower[row, right],
+            ]
             left_u = (signed(right) - 1 + COLUMNS / 2) / COLUMNS
             u, v, du, dv = left_u, 1 - 0.9 * row / (ROWS - 1), 1 / COLUMNS, 0.9 / (ROWS - 1)
             corners = [(u, v), (u, v - dv), (u + du, v - dv), (u + du, v)]

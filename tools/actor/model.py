@@ -131,7 +131,7 @@ def build_actor(seed: int | None) -> ActorModel:
         deltas=shapes.deltas,
         names=shapes.names,
         parts=_parts(sculpture, shapes),
-        rigid_vertices=rigid_vertices(lattice, sculpture.vertices),
+        rigid_vertices=rigid_vertices(lattice, sculpture.vertices, shapes.deltas),
         lid_pairs=np.concatenate([eye.pairs for eye in lattice.eyes]),
         lip_pairs=lattice.mouth.pairs,
         landmarks68=find_landmarks(lattice, sculpture, who),
@@ -145,7 +145,9 @@ def build_actor(seed: int | None) -> ActorModel:
 def _parts(sculpture: Sculpture, shapes: Shapes) -> tuple[ActorPart, ...]:
     count = len(shapes.names)
     parts = []
-    for name, ball, gaze in zip(("eye_right", "eye_left"), sculpture.balls, shapes.gaze, strict=True):
+    for name, ball, gaze in zip(
+        ("eye_right", "eye_left"), sculpture.balls, shapes.gaze, strict=True
+    ):
         mesh, local = eyeball(ball)
         still = np.zeros((count, len(local), 3))
         parts.append(ActorPart(name, "eye", mesh, local, ball, still, gaze))
@@ -173,7 +175,9 @@ def named_weights(names: tuple[str, ...], amplitudes: dict[str, float]) -> Float
     """
     weights = np.zeros(len(names))
     for name, amplitude in amplitudes.items():
-        hits = [k for k, known in enumerate(names) if known in (name, name + "Left", name + "Right")]
+        hits = [
+            k for k, known in enumerate(names) if known in (name, name + "Left", name + "Right")
+        ]
         if not hits:
             raise SettingsError(f"no shape {name!r}; the actor has {', '.join(names)}")
         weights[hits] = amplitude

@@ -140,11 +140,15 @@ def _corner(place: Floats, power: float) -> Floats:
 def _smile(place: Floats, side: Floats) -> Floats:
     pull = _corner(place, 1.7)
     lift = _corner(place, 2.2)
-    return _stack(5.5 * pull, 7.5 * lift + 0.6 * side * (1 - pull) * (place > 0), -4.5 * _corner(place, 1.3))
+    return _stack(
+        5.5 * pull, 7.5 * lift + 0.6 * side * (1 - pull) * (place > 0), -4.5 * _corner(place, 1.3)
+    )
 
 
 def _frown(place: Floats, side: Floats) -> Floats:
-    return _stack(1.0 * _corner(place, 2.0), -7.0 * _corner(place, 2.2), -1.5 * _corner(place, 2.0) + 0 * side)
+    return _stack(
+        1.0 * _corner(place, 2.0), -7.0 * _corner(place, 2.2), -1.5 * _corner(place, 2.0) + 0 * side
+    )
 
 
 def _dimple(place: Floats, side: Floats) -> Floats:

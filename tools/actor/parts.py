@@ -42,7 +42,9 @@ class ActorPart:
 
 def eyeball(centre: Floats) -> tuple[Mesh, Floats]:
     """A ball with a cornea that looks along +Z: mesh in head space, and its points from the centre."""
-    angle = np.concatenate([np.linspace(0.02, 0.75, _RINGS // 2), np.linspace(0.82, 2.6, _RINGS // 2)])
+    angle = np.concatenate(
+        [np.linspace(0.02, 0.75, _RINGS // 2), np.linspace(0.82, 2.6, _RINGS // 2)]
+    )
     around = 2.0 * np.pi * np.arange(_SECTORS) / _SECTORS
     radius = np.full(_RINGS, BALL_RADIUS)
     # The cornea is a smaller sphere set forward; the larger radius of the two shows.
@@ -52,7 +54,8 @@ def eyeball(centre: Floats) -> tuple[Mesh, Floats]:
     radius = np.where(angle < 0.75, np.maximum(radius, bulge), radius)
     sine, cosine = np.sin(angle)[:, None], np.cos(angle)[:, None]
     points = np.stack(
-        [sine * np.cos(around), sine * np.sin(around), np.broadcast_to(cosine, (_RINGS, _SECTORS))], axis=2
+        [sine * np.cos(around), sine * np.sin(around), np.broadcast_to(cosine, (_RINGS, _SECTORS))],
+        axis=2,
     )
     local = (points * radius[:, None, None]).reshape(-1, 3)
     quads = _grid_quads(_RINGS, _SECTORS, wrap=True)
@@ -89,7 +92,9 @@ def teeth(stomion: Floats, *, upper: bool) -> tuple[Mesh, Floats]:
     return Mesh(points.reshape(-1, 3), np.ascontiguousarray(quads)), local.reshape(-1, 3)
 
 
-def _grid_quads(rows: int, columns: int, *, wrap: bool) -> np.ndarray[tuple[int, int], np.dtype[np.int32]]:
+def _grid_quads(
+    rows: int, columns: int, *, wrap: bool
+) -> np.ndarray[tuple[int, int], np.dtype[np.int32]]:
     count = columns if wrap else columns - 1
     row, column = np.meshgrid(np.arange(rows - 1), np.arange(count), indexing="ij")
     right = (column + 1) % columns

@@ -57,7 +57,9 @@ class ActorRenderer:
                 self._draw_call(kind, triangles)
                 for kind, triangles in zip(_KINDS, _split(model), strict=True)
             ]
-            self._tile = context.texture(tile.shape[1::-1], 4, np.rint(tile * 255).astype(np.uint8).tobytes())
+            self._tile = context.texture(
+                tile.shape[1::-1], 4, np.rint(tile * 255).astype(np.uint8).tobytes()
+            )
             self._tile.build_mipmaps()
             self._tile.filter = (moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR)
             self._tile.repeat_x = self._tile.repeat_y = True
@@ -78,7 +80,9 @@ class ActorRenderer:
             self._rasterizer = Rasterizer(self._triangles, len(posed.surface))
         return self._rasterizer.render(camera, posed.surface).depth
 
-    def render(self, camera: Camera, posed: PosedActor, sensor: Sensor, exposure: Exposure) -> Image:
+    def render(
+        self, camera: Camera, posed: PosedActor, sensor: Sensor, exposure: Exposure
+    ) -> Image:
         """One image of the actor as a device would deliver it, noise and all.
 
         Args:
@@ -90,7 +94,9 @@ class ActorRenderer:
         Returns:
             (H, W) uint8, or uint16 for a sensor of more than 8 bits.
         """
-        return expose(self.radiance(camera, posed), sensor, (exposure.seed, camera.name, exposure.t_ns))
+        return expose(
+            self.radiance(camera, posed), sensor, (exposure.seed, camera.name, exposure.t_ns)
+        )
 
     def _draw_call(self, kind: str, triangles: Ints32) -> Any:
         """A program and vertex array for the triangles (T, 3) of one kind of surface."""

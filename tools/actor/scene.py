@@ -67,7 +67,8 @@ class ActorScene:
         self.settings = settings
         self.model: ActorModel = build_actor(settings.actor)
         self._amplitudes = {
-            act.slate: named_weights(self.model.names, dict(act.weights)) for act in settings.script.acts
+            act.slate: named_weights(self.model.names, dict(act.weights))
+            for act in settings.script.acts
         }
         self._canvas: Canvas | None = None
         self._face: ActorRenderer | None = None

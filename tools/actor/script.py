@@ -43,7 +43,9 @@ class Act:
         if self.kind not in ("board", "face"):
             problems.append(f'kind must be "board" or "face", found {self.kind!r}')
         if self.end_ns < self.start_ns:
-            problems.append(f"end_ns must not lie before start_ns = {self.start_ns}, found {self.end_ns}")
+            problems.append(
+                f"end_ns must not lie before start_ns = {self.start_ns}, found {self.end_ns}"
+            )
         if self.hold_ns < 1:
             problems.append(f"hold_ns must be above 0, found {self.hold_ns}")
         if self.kind == "board" and self.weights:
@@ -105,7 +107,11 @@ class Plan:
 
 
 def make_script(
-    plans: Sequence[Plan], *, period_ns: int, start_ns: int = 1_000_000_000, gap_ns: int = 2_000_000_000
+    plans: Sequence[Plan],
+    *,
+    period_ns: int,
+    start_ns: int = 1_000_000_000,
+    gap_ns: int = 2_000_000_000,
 ) -> Script:
     """Lay acts out in time, so that each one's triggers begin and end it exactly.
 

@@ -20,7 +20,7 @@ EYE_LEVEL = 8.0
 BALL_RADIUS = 12.6
 LID_RADIUS = 13.9  # the skin of the lids, from the centre of the ball
 _STOMION = -58.0
-_EYE_HALF = 14.3
+_EYE_HALF = 14.0
 
 # row, front y, front z, half breadth, z of the broadest point, back z, front exponent, side y, back y,
 # half breadth of the rear
@@ -123,7 +123,9 @@ def _loft() -> Floats:
         x, z = breadth * radius * sine, middle_z + depth * radius * cosine
         rows.append(row)
         contours.append(np.stack([x, y, z], axis=1))
-    lofted: Floats = CubicSpline(rows, np.stack(contours), axis=0, bc_type="natural")(np.arange(ROWS))
+    lofted: Floats = CubicSpline(rows, np.stack(contours), axis=0, bc_type="natural")(
+        np.arange(ROWS)
+    )
     lofted[0, :, 0] = 0.0
     return lofted
 
@@ -138,7 +140,9 @@ def _proportions(points: Floats, who: Identity) -> Floats:
     side = np.tanh(x / 20.0)
     out[:, 0] += side * who.cheek_width * bump((wide - 62) / 28, (y + 12) / 26, (z - 25) / 40)
     out[:, 0] += side * who.jaw_width * bump((wide - 52) / 26, (y + 78) / 24, (z - 12) / 45)
-    out[:, 0] += side * who.eye_spacing * bump((wide - 31) / 22, (y - EYE_LEVEL) / 18, (z - 75) / 40)
+    out[:, 0] += (
+        side * who.eye_spacing * bump((wide - 31) / 22, (y - EYE_LEVEL) / 18, (z - 75) / 40)
+    )
     out[:, 2] += who.chin_forward * bump(x / 28, (y + 94) / 18, (z - 85) / 40)
     return out
 
@@ -196,7 +200,9 @@ def _lips(x: Floats, y: Floats, who: Identity) -> Floats:
     share = np.where(level > 0, level / upper, -level / lower)
     across = np.clip(1.0 - (x / (half + 2.0)) ** 2, 0.0, 1.0) ** 0.7
     swell = np.where(level > 0, 0.40 * upper, 0.40 * lower) * across
-    full = np.sqrt(np.clip(1.0 - ((share - 0.45) / 1.15) ** 2, 0.0, 1.0)) * smooth_step(1.6, 0.9, share)
+    full = np.sqrt(np.clip(1.0 - ((share - 0.45) / 1.15) ** 2, 0.0, 1.0)) * smooth_step(
+        1.6, 0.9, share
+    )
     push = 2.6 * bump(x / 30, (level - 2) / 17)
     push = push + swell * full
     push += 0.6 * bump(x / 4, (level - 3.4) / 3.0)
@@ -216,8 +222,10 @@ def lip_heights(x: Floats, who: Identity) -> tuple[Floats, Floats]:
     """Heights of the red of the upper and lower lip at x, mm; a bow above, an arc below."""
     place = np.clip(np.abs(x) / who.mouth_half_width, 0.0, 1.0)
     taper = np.sqrt(np.clip(1.0 - place * place, 0.02, 1.0))
-    upper = who.lip_fullness * taper * (6.4 + 2.2 * bump((np.abs(x) - 6.0) / 5.5) - 0.8 * bump(x / 3.0))
-    lower = who.lip_fullness * taper**1.15 * 9.6
+    upper = (
+        who.lip_fullness * taper * (6.4 + 2.2 * bump((np.abs(x) - 6.0) / 5.5) - 0.8 * bump(x / 3.0))
+    )
+    lower = who.lip_fullness * taper**1.15 * 8.8
     return upper + 0.3, lower + 0.3
 
 
@@ -287,7 +295,11 @@ def _roll_lids(points: Floats, slit: Slit, ball: Floats) -> Floats:
     edge = edge * (level / radius)
     out[slit.rings[0]] = ball + edge
     away = edge - middle
-    for ring, reach, depth in ((1, 0.0, BALL_RADIUS + 0.3), (2, 0.25, BALL_RADIUS + 0.2), (3, 0.6, BALL_RADIUS - 0.8)):
+    for ring, reach, depth in (
+        (1, 0.0, BALL_RADIUS + 0.3),
+        (2, 0.25, BALL_RADIUS + 0.2),
+        (3, 0.6, BALL_RADIUS - 0.8),
+    ):
         direction = edge + reach * away
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
         out[slit.rings[ring]] = ball + depth * direction
@@ -314,7 +326,9 @@ def _mouth(points: Floats, lattice: Lattice, who: Identity) -> Floats:
         across = np.sqrt(np.clip(1.0 - (edge[:, 0] / (who.mouth_half_width + 1.0)) ** 2, 0.0, 1.0))
         moved = edge * [scale, 1.0, 1.0]
         moved[:, 1] += sign * opened * across
-        moved[:, 2] = np.maximum(edge[:, 2] - depth, 34.0 - ring) if ring > 4 else edge[:, 2] - depth
+        moved[:, 2] = (
+            np.maximum(edge[:, 2] - depth, 34.0 - ring) if ring > 4 else edge[:, 2] - depth
+        )
         out[slit.rings[ring]] = moved
     return out
 
@@ -323,7 +337,9 @@ def _dense_lips(points: Floats, who: Identity) -> Floats:
     """Heights (V,) with the rows drawn together about the line of the mouth, mm."""
     x, y, z = points.T
     level = y - stomion_level(who)
-    pull = 0.45 * bump(level / 3.2) * smooth_step(42.0, 26.0, np.abs(x)) * smooth_step(30.0, 50.0, z)
+    pull = (
+        0.45 * bump(level / 3.2) * smooth_step(42.0, 26.0, np.abs(x)) * smooth_step(30.0, 50.0, z)
+    )
     dense: Floats = y - level * pull
     return dense
 

@@ -95,7 +95,9 @@ def expose(radiance: Floats32, sensor: Sensor, key: tuple[int, str, int]) -> Ima
     seed, name, t_ns = key
     random = np.random.default_rng([abs(seed), zlib.crc32(name.encode()), abs(t_ns)])
     noise = random.standard_normal(level.shape, dtype=np.float32)
-    spread = np.sqrt(np.float32(sensor.read_dn**2) + np.float32(sensor.shot_dn) * np.maximum(level, 0.0))
+    spread = np.sqrt(
+        np.float32(sensor.read_dn**2) + np.float32(sensor.shot_dn) * np.maximum(level, 0.0)
+    )
     level = level + noise * spread
     if sensor.bits == 8:
         return np.clip(np.rint(level), 0, 255).astype(np.uint8)

@@ -56,7 +56,11 @@ def paint_skin(lattice: Lattice, sculpture: Sculpture, normals: Floats, who: Ide
     albedo *= 1.0 - 0.12 * bump(x / 11, (y + 27) / 8)
     albedo *= 1.0 - 0.10 * bump((wide - 30) / 15, (y - EYE_LEVEL + 9) / 4) * (y < EYE_LEVEL)
     albedo *= _hollows(lattice, points, normals)
-    nostril = bump((wide - 6.2) / 3.4, (y + who.nose_length + 34.0) / 2.2) * (z > 80) * (normals[:, 1] < 0.1)
+    nostril = (
+        bump((wide - 6.2) / 3.4, (y + who.nose_length + 34.0) / 2.2)
+        * (z > 80)
+        * (normals[:, 1] < 0.1)
+    )
     albedo *= 1.0 - 0.75 * nostril
     lip = _lips(points, who) * (z > 60)
     albedo *= 1.0 - 0.34 * lip
@@ -72,7 +76,7 @@ def paint_skin(lattice: Lattice, sculpture: Sculpture, normals: Floats, who: Ide
         albedo[eye.upper] = who.skin * 0.3
         albedo[eye.lower] = who.skin * 0.62
         albedo[eye.corners] = who.skin * 0.5
-    hair = smooth_step(0.2, 0.9, _hairline(points) + 0.10 * wave(points, who.seed + 8, 16.0))
+    hair = smooth_step(0.0, 1.1, _hairline(points) + 0.10 * wave(points, who.seed + 8, 16.0))
     return Paint(albedo, _brows(points, who), hair * outer, lip, wet)
 
 
@@ -81,7 +85,9 @@ def _hollows(lattice: Lattice, points: Floats, normals: Floats) -> Floats:
     triangles = np.concatenate([lattice.polygons[:, [0, 1, 2]], lattice.polygons[:, [0, 2, 3]]])
     edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
     count = len(points)
-    link = sparse.coo_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), (count, count)).tocsr()
+    link = sparse.coo_matrix(
+        (np.ones(len(edges)), (edges[:, 0], edges[:, 1])), (count, count)
+    ).tocsr()
     link = link + link.T
     degree = np.asarray(link.sum(axis=1)).ravel()
     mean = sparse.diags_array(1.0 / degree) @ link
@@ -109,10 +115,10 @@ def _brows(points: Floats, who: Identity) -> Floats:
     """Signed closeness to the eyebrows' strokes: 0.5 at the edge, more inside, 0 far away."""
     x, y, z = points.T
     lift = who.brow_height
-    place = np.clip((np.abs(x) - 10.0) / 40.0, 0.0, 1.0)
-    level = 20.5 + lift + 9.0 * place ** 0.8 - 9.5 * np.clip(place - 0.62, 0.0, 1.0) ** 1.4 * 2.0
+    place = np.clip((np.abs(x) - 10.0) / 44.0, 0.0, 1.0)
+    level = 20.5 + lift + 9.0 * place**0.8 - 9.5 * np.clip(place - 0.62, 0.0, 1.0) ** 1.4 * 2.0
     thick = who.brow_thickness * (1.0 - 0.62 * place**1.6)
-    beyond = np.maximum(np.maximum(10.0 - np.abs(x), np.abs(x) - 51.0), 0.0)
+    beyond = np.maximum(np.maximum(10.0 - np.abs(x), np.abs(x) - 54.0), 0.0)
     away = np.hypot((y - level) / thick, beyond / 3.0)
     inside: Floats = np.clip(1.2 - 0.7 * away, 0.0, 1.0) * (z > 20)
     return inside
@@ -125,7 +131,7 @@ def _hairline(points: Floats) -> Floats:
     line = 66.0 - 2.0 * np.exp(-((np.abs(x) - 30.0) ** 2) / 200.0) - rear**1.4 * 120.0
     line = np.where(z < -30, -55.0, line)
     temple = 22.0 * bump((z - 12.0) / 12.0)
-    ear = bump((np.abs(x) - 80.0) / 9.0) * bump((z + 18.0) / 20.0, (y + 8.0) / 34.0)
+    ear = bump((np.abs(x) - 80.0) / 14.0) * bump((z + 24.0) / 22.0, (y + 8.0) / 33.0)
     grown: Floats = 0.5 + (y - line + temple * (y < 40)) / 22.0 - 2.0 * ear
     return grown
 
@@ -168,7 +174,7 @@ def make_tile(seed: int, freckles: float) -> Floats32:
     pores = dots(0.55, 0.26) + dots(0.9, 0.16)
     spots = np.clip(dots(0.035, 0.62), 0.0, 1.2)
     mottle = 0.55 * band(1.1) + 0.6 * band(2.2) + 0.55 * band(5.0)
-    albedo = 0.5 + 0.052 * mottle - 0.12 * np.clip(pores, 0, 1.6) - 0.15 * freckles * spots
+    albedo = 0.5 + 0.045 * mottle - 0.12 * np.clip(pores, 0, 1.6) - 0.15 * freckles * spots
     height = 0.035 * band(0.6) + 0.05 * band(1.4) - 0.10 * pores
     step = TILE_MM / _TILE
     slope_x = (np.roll(height, -1, 1) - np.roll(height, 1, 1)) / (2.0 * step)

@@ -32,7 +32,11 @@ def _brow_down(field: Field) -> Floats:
     mask = _above_lids(field) * field.left
     whole = mask * bump((field.x - 26.0) / 21.0, (field.y - 26.0) / 13.0)
     inner = mask * bump((field.x - 11.0) / 9.0, (field.y - 24.0) / 11.0)
-    root = field.left * bump((field.x - 5.0) / 6.0, (field.y - 16.0) / 7.0) * smooth_step(60, 80, field.z)
+    root = (
+        field.left
+        * bump((field.x - 5.0) / 6.0, (field.y - 16.0) / 7.0)
+        * smooth_step(60, 80, field.z)
+    )
     delta = field.vector(whole, -1.6, -5.6, 0.6) + field.vector(inner, -1.6, -1.6, 1.6)
     return delta + field.vector(root, 0.0, -0.8, 0.9)
 

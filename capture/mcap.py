@@ -22,6 +22,7 @@ from typing import BinaryIO
 import numpy as np
 
 from capture.arrays import Image
+from capture.crc import Crc32Joiner
 from capture.errors import TakeError
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -175,6 +176,7 @@ class FrameWriter:
         self._partial = self.path.with_name(self.path.name + ".partial")
         self._file: BinaryIO = self._partial.open("wb", buffering=0)
         self._offset = 0
+        self._joiner = Crc32Joiner(layout.nbytes)
         self._index: list[tuple[int, int, int]] = []  # log time, offset and length of each chunk
         metadata = {
             "device": device,
@@ -226,7 +228,7 @@ class FrameWriter:
             + header.pack()
         )
         records = len(prefix) + len(raw)
-        crc = zlib.crc32(raw, zlib.crc32(prefix))
+        crc = self._joiner.join(zlib.crc32(prefix), header.pixel_crc)
         head = _CHUNK_HEAD.pack(time, time, records, crc, 0) + struct.pack("<Q", records)
         chunk = _RECORD.pack(_CHUNK, len(head) + records) + head
         start = self._offset
@@ -333,22 +335,20 @@ class FrameReader:
             TakeError: naming the file and the frame, when its bytes are not those written.
         """
         skip = _RECORD.size + _CHUNK_HEAD.size + 8
-        size = _PREFIX + self.layout.nbytes
-        with self.path.open("rb") as file:
+        pixels = np.empty(self.layout.shape, np.dtype(self.layout.dtype).newbyteorder("<"))
+        raw = pixels.data.cast("B")
+        with self.path.open("rb", buffering=0) as file:
             file.seek(self._offsets[index])
-            data = file.read(skip + size)
+            head = file.read(skip + _PREFIX)
+            count = len(head) + (file.readinto(raw) or 0)
         label = f"{self.path}: frame {index} (trigger {self.headers[index].trigger_index})"
-        if len(data) != skip + size:
-            raise TakeError(f"{label}: expected {skip + size} bytes, found {len(data)}")
-        crc = _CHUNK_HEAD.unpack_from(data, _RECORD.size)[3]
-        body = memoryview(data)[skip:]
-        found = zlib.crc32(body)
-        if found != crc:
-            raise TakeError(f"{label}: damaged: expected CRC {crc:08x}, found {found:08x}")
-        pixels = np.frombuffer(
-            data, np.dtype(self.layout.dtype).newbyteorder("<"), offset=skip + _PREFIX
-        )
-        return pixels.astype(self.layout.dtype).reshape(self.layout.shape)
+        if count != skip + _PREFIX + len(raw):
+            raise TakeError(f"{label}: expected {skip + _PREFIX + len(raw)} bytes, found {count}")
+        expected = _CHUNK_HEAD.unpack_from(head, _RECORD.size)[3]
+        found = zlib.crc32(raw, zlib.crc32(head[skip:]))
+        if found != expected:
+            raise TakeError(f"{label}: damaged: expected CRC {expected:08x}, found {found:08x}")
+        return pixels.astype(self.layout.dtype, copy=False)
 
     def _read_head(self, file: BinaryIO) -> tuple[str, ImageLayout, int]:
         file.seek(0)

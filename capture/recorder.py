@@ -13,6 +13,7 @@ from capture.errors import SettingsError
 from capture.frame import FrameEvent
 from capture.ledger import Ledger
 from capture.mcap import FrameHeader
+from capture.settings import check_range
 
 Sink = Callable[[str, FrameHeader, Image], None]
 
@@ -40,20 +41,15 @@ class RecordSettings:
     keep_incomplete: bool = False
 
     def __post_init__(self) -> None:
-        ranges = {
-            "rate_hz": (self.rate_hz, 1, 1000),
-            "exposure_us": (self.exposure_us, 1, 1e6),
-            "pre_roll": (self.pre_roll, 0, 1000),
-            "post_roll": (self.post_roll, 0, 1000),
-            "retention_ms": (self.retention_ms, 1, 10_000),
-            "latches": (self.latches, 1, 1000),
-        }
-        for name, (value, low, high) in ranges.items():
-            if not low <= value <= high:
-                raise SettingsError(f"{name} must lie in {low:g}..{high:g}, found {value}")
+        check_range("record.rate_hz", self.rate_hz, 1, 1000)
+        check_range("record.exposure_us", self.exposure_us, 1, 1e6)
+        check_range("record.pre_roll", self.pre_roll, 0, 1000)
+        check_range("record.post_roll", self.post_roll, 0, 1000)
+        check_range("record.retention_ms", self.retention_ms, 1, 10_000)
+        check_range("record.latches", self.latches, 1, 1000)
         if self.exposure_us >= 1e6 / self.rate_hz:
             raise SettingsError(
-                f"exposure_us must be below the period of {1e6 / self.rate_hz:.0f} us, "
+                f"record.exposure_us must be below the period of {1e6 / self.rate_hz:.0f} us, "
                 f"found {self.exposure_us}"
             )
 

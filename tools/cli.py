@@ -37,7 +37,7 @@ VERBS: dict[str, str] = {
 
 _MODULES = {"import": "tools.verbs.visit", "demo": "tools.verbs.demonstrate"}
 _STAGES = {
-    "calibrate": ("recon.calibrate", "CalibrateSettings"),
+    "calibrate": ("recon.array_solver", "CalibrateSettings"),
     "recon": ("recon.scan", "ReconSettings"),
     "neutral": ("track.neutral", "NeutralSettings"),
     "track": ("track.stage", "TrackSettings"),

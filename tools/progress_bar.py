@@ -23,14 +23,16 @@ class ProgressBar:
         self._fancy = self._stream.isatty()
         self._bar: tqdm[None] | None = None
         self._what = ""
-        self._started = 0.0
+        self._started = time.monotonic()  # of the work that is shown
+        self._heard = self._started
         self._spoken = 0.0
 
     def __call__(self, done: int, total: int, what: str) -> None:
         """Show that `done` of `total` steps of `what` are finished."""
         if what != self._what:
             self.close()
-            self._what, self._started = what, time.monotonic()
+            self._what, self._started = what, self._heard  # it began when the last one ended
+        self._heard = time.monotonic()
         if self._fancy:
             self._draw(done, total)
         else:

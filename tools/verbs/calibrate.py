@@ -15,8 +15,9 @@ import tyro
 
 from capture.progress import Progress
 from capture.take import Take
+from recon.array_solver import CalibrateSettings
 from recon.board import read_board
-from recon.calibrate import CalibrateSettings, calibrate
+from recon.calibrate import calibrate
 from tools.report import write_calibration_page
 from tools.verbs.options import Options
 

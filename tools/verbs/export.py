@@ -29,7 +29,7 @@ class Arguments(Options):
 
 
 def run(arguments: Arguments, progress: Progress) -> dict[str, Any]:
-    """Export and report the file's size."""
-    export(arguments.thing, arguments.out, fps=arguments.fps)
+    """Export and report the files and their size."""
+    files = export(arguments.thing, arguments.out, fps=arguments.fps)
     progress(1, 1, "export")
-    return {"file": str(arguments.out), "bytes": arguments.out.stat().st_size}
+    return {"files": [str(path) for path in files], "bytes": sum(p.stat().st_size for p in files)}

@@ -30,6 +30,5 @@ class Arguments(Options):
 
 def run(arguments: Arguments, progress: Progress) -> dict[str, Any]:
     """Write the page and report its size."""
-    report_for_take(arguments.take, arguments.out, rig=arguments.rig)
-    progress(1, 1, "report")
+    report_for_take(arguments.take, arguments.out, rig=arguments.rig, progress=progress)
     return {"page": str(arguments.out), "bytes": arguments.out.stat().st_size}

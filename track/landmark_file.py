@@ -11,8 +11,9 @@ import numpy as np
 
 from capture.arrays import Floats, Ints
 from capture.camera import CameraArray
-from capture.errors import InputError, TakeError, raise_all
+from capture.errors import TakeError, raise_all
 
+_LEAST_SPREAD = np.sin(np.radians(0.5))  # between two rays that are to be met
 _KEYS = {"space", "points", "views"}
 
 
@@ -78,6 +79,10 @@ def read_landmarks(path: Path, vertex_count: int, cameras: CameraArray) -> Landm
     for vertex, lines in sorted(rays.items()):
         if len(lines) < 2:
             problems.append(f"views: vertex {vertex} is marked in one view; two or more are needed")
+        elif _spread(lines) < _LEAST_SPREAD:
+            problems.append(
+                f"views: vertex {vertex}: its rays are parallel; mark it in another view"
+            )
         elif vertex not in found:
             found[vertex] = _meet(lines)
     if not problems and not found:
@@ -137,6 +142,12 @@ def _numbers(
     return None
 
 
+def _spread(lines: list[tuple[Floats, Floats]]) -> float:
+    """The sine of the widest angle between the first line (origin, direction) and the others."""
+    units = np.array([direction / np.linalg.norm(direction) for _, direction in lines])
+    return float(np.linalg.norm(np.cross(units[:1], units), axis=1).max())
+
+
 def _meet(lines: list[tuple[Floats, Floats]]) -> tuple[Floats, float]:
     """The point nearest to all lines (origin, direction), and its rms distance from them."""
     across = []
@@ -145,8 +156,6 @@ def _meet(lines: list[tuple[Floats, Floats]]) -> tuple[Floats, float]:
         across.append(np.eye(3) - np.outer(unit, unit))
     system = np.sum(across, axis=0)
     right = np.sum([part @ origin for part, (origin, _) in zip(across, lines, strict=True)], axis=0)
-    if np.linalg.cond(system) > 1e8:
-        raise InputError("landmarks: the rays of a mark are parallel; mark it in another view")
     point: Floats = np.linalg.solve(system, right)
     gaps = [part @ (point - origin) for part, (origin, _) in zip(across, lines, strict=True)]
     return point, float(np.sqrt(np.mean([gap @ gap for gap in gaps])))

@@ -64,8 +64,8 @@ class BoardRenderer:
 
         Args:
             camera: the true projection.
-            world_from_board: where the board is held; board space is that of `recon.board`. Its back
-                shows no pattern.
+            world_from_board: where the board is held; board space is that of `recon.board`. Its
+                back shows no pattern.
         """
         corners = world_from_board.apply(self._corners)
         outward = -world_from_board.rotation[:, 2]

@@ -1,4 +1,4 @@
-"""The drawing surface: supersampled pinhole drawing, brought to the sensor through the true lens."""
+"""The drawing surface: supersampled pinhole drawing, seen through the true lens."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class Canvas:
         self._lenses: dict[tuple[float, ...], tuple[Floats, Floats32, Floats32]] = {}
 
     def view(self, camera: Camera) -> View:
-        """Prepare a camera: the pinhole image that covers the sensor, and the map through the lens."""
+        """Prepare a camera: the pinhole image that covers its sensor, the map through its lens."""
         key = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy,
                *camera.distortion.tolist())  # fmt: skip
         if key not in self._lenses:
@@ -104,14 +104,13 @@ class Canvas:
     def finish(self, view: View) -> Floats32:
         """What the sensor sees through the lens, (H, W) float32, each pixel an area average.
 
-        The average is a binomial of three samples either way, symmetric about the pixel's centre, so
-        that nothing shifts.
+        The average is symmetric about the pixel's centre, so that nothing shifts.
         """
         drawn = self.pinhole(view)
         if self.supersample > 1:
             reach = 2 * (self.supersample // 2) + 1
             kernel = cv2.getGaussianKernel(reach, 0.36 * self.supersample, cv2.CV_32F)
-            drawn = cv2.sepFilter2D(drawn, cv2.CV_32F, kernel, kernel)
+            drawn = np.asarray(cv2.sepFilter2D(drawn, cv2.CV_32F, kernel, kernel), np.float32)
         bent = cv2.remap(
             drawn, view.columns, view.rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
         )

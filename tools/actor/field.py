@@ -1,4 +1,4 @@
-"""What the shape makers work on: the neutral's coordinates, masks, mirroring, smooth interpolation."""
+"""What the shape makers work on: the neutral, its mirror image, smooth interpolation."""
 
 from __future__ import annotations
 
@@ -92,13 +92,12 @@ class Interpolator:
         inverse = sparse.diags_array(1.0 / np.maximum(degree, 1e-9))
         plate = (laplacian @ inverse @ laplacian).tocsr()
         rows = plate[self._free]
-        self._solver = splu(
-            rows[:, self._free].tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}
-        )
+        free = rows[:, self._free].tocsc()
+        self._solver = splu(free, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
         self._coupling = rows[:, self._held]
 
     def spread(self, values: Floats) -> Floats:
-        """(V, k) smooth values that agree with `values` (V, k) at the held vertices; rings get 0."""
+        """(V, k) smooth values that agree with `values` (V, k) where held; rings get 0."""
         out = np.zeros((self._count, values.shape[1]))
         out[self._held] = values[self._held]
         out[self._free] = self._solver.solve(-(self._coupling @ values[self._held]))

@@ -6,10 +6,19 @@ import numpy as np
 
 from capture.arrays import Floats, Ints
 from tools.actor.identity import Identity
-from tools.actor.lattice import Lattice
+from tools.actor.lattice import Lattice, Slit
 from tools.actor.sculpt import Sculpture, lip_heights, stomion_level
 
-_SIDE = 0.5
+_JAW_LEFT: list[tuple[float, float, float | None]] = [
+    (74.0, 17.5, -4.0),
+    (71.5, -3.5, 2.0),
+    (68.5, -24.0, 6.0),
+    (64.0, -44.0, 9.0),
+    (57.5, -63.5, 16.0),
+    (48.0, -81.0, 30.0),
+    (34.5, -94.0, 49.0),
+    (18.0, -101.0, 69.0),
+]
 
 
 def find_landmarks(lattice: Lattice, sculpture: Sculpture, who: Identity) -> Ints:
@@ -22,8 +31,8 @@ def find_landmarks(lattice: Lattice, sculpture: Sculpture, who: Identity) -> Int
     """
     places = _jaw() + _brows(who) + _nose(who)
     ids = [_nearest(lattice, sculpture.vertices, place) for place in places]
-    for eye, mirrored in ((lattice.eyes[0], False), (lattice.eyes[1], True)):
-        ids += _eye(sculpture.vertices, eye.corners, eye.upper, eye.lower, mirrored)
+    for eye in lattice.eyes:
+        ids += _eye(sculpture.vertices, eye)
     return np.array(ids + _mouth(lattice, sculpture, who), np.int64)
 
 
@@ -56,10 +65,8 @@ def _nearest(lattice: Lattice, vertices: Floats, place: tuple[float, float, floa
 
 
 def _jaw() -> list[tuple[float, float, float | None]]:
-    left = [(74.0, 17.5, -4.0), (71.5, -3.5, 2.0), (68.5, -24.0, 6.0), (64.0, -44.0, 9.0),
-            (57.5, -63.5, 16.0), (48.0, -81.0, 30.0), (34.5, -94.0, 49.0), (18.0, -101.0, 69.0)]  # fmt: skip
-    right = [(-x, y, z) for x, y, z in left]
-    return [*right, (0.0, -102.5, 83.0), *left[::-1]]
+    right = [(-x, y, z) for x, y, z in _JAW_LEFT]
+    return [*right, (0.0, -102.5, 83.0), *_JAW_LEFT[::-1]]
 
 
 def _brows(who: Identity) -> list[tuple[float, float, float | None]]:
@@ -77,23 +84,16 @@ def _nose(who: Identity) -> list[tuple[float, float, float | None]]:
     return [*bridge, *base]
 
 
-def _eye(vertices: Floats, corners: Ints, upper: Ints, lower: Ints, mirrored: bool) -> list[int]:
+def _eye(vertices: Floats, eye: Slit) -> list[int]:
     """Six ids in dlib's order: image-left corner, two above, image-right corner, two below."""
-    first, last = vertices[corners[0], 0], vertices[corners[1], 0]
-    span = last - first
+    first, last = vertices[eye.corners, 0]
 
     def at(edge: Ints, share: float) -> int:
-        return int(edge[np.argmin(np.abs(vertices[edge, 0] - first - share * span))])
+        return int(edge[np.argmin(np.abs(vertices[edge, 0] - first - share * (last - first)))])
 
-    del mirrored
-    return [
-        int(corners[0]),
-        at(upper, 0.32),
-        at(upper, 0.68),
-        int(corners[1]),
-        at(lower, 0.68),
-        at(lower, 0.32),
-    ]
+    above = [at(eye.upper, 0.32), at(eye.upper, 0.68)]
+    below = [at(eye.lower, 0.68), at(eye.lower, 0.32)]
+    return [int(eye.corners[0]), *above, int(eye.corners[1]), *below]
 
 
 def _mouth(lattice: Lattice, sculpture: Sculpture, who: Identity) -> list[int]:

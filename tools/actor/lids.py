@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
-from capture.arrays import Bools, Floats
+from capture.arrays import Bools, Floats, Ints
 from tools.actor.field import Field
 from tools.actor.lattice import EYE_ROW, Slit
 from tools.actor.sculpt import LID_RADIUS, bump, smooth_step
@@ -42,15 +40,6 @@ def _under_eye(field: Field, sign: float) -> Floats:
     return field.vector(bag, 0.4 * sign, 1.6, 0.9)
 
 
-@dataclass(frozen=True, eq=False)
-class _Rows:
-    """The rows of skin of one lid that turn: ids, share of the turn, which slit column."""
-
-    ids: Floats
-    share: Floats
-    column: Floats
-
-
 class _Lid:
     """One eye's lids."""
 
@@ -81,7 +70,7 @@ class _Lid:
         self._roll(delta)
         return delta
 
-    def _edge(self, ids: Floats, turn: Floats) -> Floats:
+    def _edge(self, ids: Ints, turn: Floats) -> Floats:
         """Edge vertices turned about the ball; partners that reach one angle reach one point."""
         pairs = self.field.points[self.slit.pairs].mean(axis=1) - self.ball
         local = self.field.points[ids] - self.ball
@@ -99,7 +88,7 @@ class _Lid:
         moved: Floats = self.ball + turned
         return moved
 
-    def _follow(self, delta: Floats, ids: Floats, turn: Floats, rows: Floats) -> None:
+    def _follow(self, delta: Floats, ids: Ints, turn: Floats, rows: Ints) -> None:
         """Turn the rows of skin beyond an edge, the less the further they lie from it."""
         field = self.field
         fade = float(np.abs(rows).max()) + 1.0
@@ -129,9 +118,9 @@ class _Lid:
         local = field.points - self.ball
         height = bump((local[:, 0] - shift) / 5.0, local[:, 1] / 8.0)
         height = height - 0.6 * bump(local[:, 0] / 5.0, local[:, 1] / 8.0)
-        push = np.where(near, 0.55 * height, 0.0)
+        push: Floats = np.where(near, 0.55 * height, 0.0)
         length = np.maximum(np.linalg.norm(local, axis=1), 1.0)
-        delta = push[:, None] * local / length[:, None]
+        delta: Floats = push[:, None] * local / length[:, None]
         delta[self.slit.corners] = 0.0
         self._roll(delta)
         return delta

@@ -26,7 +26,8 @@ def wave(points: Floats, seed: int, wavelength_mm: float) -> Floats:
     rates = 2.0 * np.pi / (wavelength_mm * random.uniform(0.75, 1.6, _WAVES))
     phases = random.uniform(0.0, 2.0 * np.pi, _WAVES)
     total: Floats = np.sin(points @ (directions * rates[:, None]).T + phases).sum(axis=1)
-    return total / np.sqrt(_WAVES / 2.0)
+    total /= np.sqrt(_WAVES / 2.0)
+    return total
 
 
 def lumps(points: Floats, amplitude_mm: float, seed: int) -> Floats:

@@ -20,14 +20,18 @@ _MEETING = 0.6  # where lips meet over an open jaw, from the upper lip's place
 def move_jaw(name: str, points: Floats) -> Floats:
     """Where points (N, 3) on the jaw bone go at weight 1 of a jaw shape, head space mm."""
     away = points - _HINGE
+    moved: Floats
     if name == "jawOpen":
         turn = Pose.from_rotation_vector(np.array([_JAW_OPEN_RADIANS, 0.0, 0.0]), np.zeros(3))
-        return turn.apply(away) + _HINGE + np.array([0.0, -1.5, 3.0])
+        moved = turn.apply(away) + _HINGE + np.array([0.0, -1.5, 3.0])
+        return moved
     if name == "jawForward":
-        return points + np.array([0.0, -0.8, 7.0])
+        moved = points + np.array([0.0, -0.8, 7.0])
+        return moved
     sign = 1.0 if name == "jawLeft" else -1.0
     turn = Pose.from_rotation_vector(np.array([0.0, sign * 0.085, 0.0]), np.zeros(3))
-    return turn.apply(away) + _HINGE + np.array([sign * 1.0, -1.0, 0.5])
+    moved = turn.apply(away) + _HINGE + np.array([sign * 1.0, -1.0, 0.5])
+    return moved
 
 
 def jaw_shapes(field: Field) -> dict[str, Floats]:

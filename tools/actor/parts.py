@@ -1,4 +1,4 @@
-"""The parts that are no skin: eyeballs and two rows of teeth, true surfaces with their own motion."""
+"""The parts that are no skin: eyeballs and teeth, true surfaces with their own motion."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ class ActorPart:
         name: eye_right, eye_left, teeth_upper or teeth_lower.
         kind: "eye" or "teeth", for the shader.
         mesh: the part in head space at rest, mm.
-        local: (V, 3) rest coordinates the shader paints by: for an eye from its centre with +Z along
-            the gaze, for teeth (arc length, height above the cutting edge, 0), mm.
+        local: (V, 3) rest coordinates the shader paints by: for an eye from its centre with +Z
+            along the gaze, for teeth (arc length, height above the cutting edge, 0), mm.
         centre: (3,) what the gaze turns about, head space, mm.
         deltas: (B, V, 3) mm at weight 1 of each shape.
         gaze: (B, 2) radians at weight 1: turn to +X about +Y, and turn up.
@@ -41,7 +41,7 @@ class ActorPart:
 
 
 def eyeball(centre: Floats) -> tuple[Mesh, Floats]:
-    """A ball with a cornea that looks along +Z: mesh in head space, and its points from the centre."""
+    """A ball with a cornea that looks along +Z: mesh in head space, its points from the centre."""
     angle = np.concatenate(
         [np.linspace(0.02, 0.75, _RINGS // 2), np.linspace(0.82, 2.6, _RINGS // 2)]
     )
@@ -65,7 +65,7 @@ def eyeball(centre: Floats) -> tuple[Mesh, Floats]:
 
 
 def teeth(stomion: Floats, *, upper: bool) -> tuple[Mesh, Floats]:
-    """A row of teeth on its arch: mesh in head space, and (arc length, height, 0) of each vertex."""
+    """A row of teeth on its arch: mesh in head space, (arc length, height, 0) of each vertex."""
     turn = np.linspace(-1.15, 1.15, _TEETH_COLUMNS)
     breadth, depth = (27.0, 34.0) if upper else (25.5, 33.0)
     front = stomion[2] - (10.5 if upper else 13.5)

@@ -145,7 +145,7 @@ def head_pose(phase: float, motion: float) -> Pose:
 
 
 def board_pose(index: int, seed: int, size_mm: tuple[float, float]) -> Pose:
-    """world_from_board of the index-th way to hold a board: facing all about, tilted up to 50 degrees.
+    """world_from_board of the index-th way to hold a board: facing all about, tilted up to 45 deg.
 
     Args:
         index: which way; neighbours face far apart.

@@ -22,8 +22,8 @@ LID_RADIUS = 13.9  # the skin of the lids, from the centre of the ball
 _STOMION = -58.0
 _EYE_HALF = 14.0
 
-# row, front y, front z, half breadth, z of the broadest point, back z, front exponent, side y, back y,
-# half breadth of the rear
+# row, front y, front z, half breadth, z of the broadest point, back z, front exponent, side y,
+# back y, half breadth of the rear
 _CONTOURS = (
     (20, 43.0, 93.5, 75.0, -8.0, -101.0, 2.25, 40.0, 36.0, 75.0),
     (28, 26.0, 94.0, 74.5, -9.0, -101.0, 2.35, 22.0, 14.0, 74.5),
@@ -148,7 +148,7 @@ def _proportions(points: Floats, who: Identity) -> Floats:
 
 
 def _features(points: Floats, who: Identity) -> Floats:
-    """Push the face along +Z (and a little along Y) into brows, sockets, nose, cheeks, lips, chin."""
+    """Push the face along +Z, a little along Y, into brows, sockets, nose, cheeks, lips, chin."""
     x, y, z = points.T
     wide = np.abs(x)
     front = smooth_step(-20.0, 30.0, z)
@@ -286,7 +286,7 @@ def _crease_level(place: Floats, who: Identity) -> Floats:
 
 
 def _roll_lids(points: Floats, slit: Slit, ball: Floats) -> Floats:
-    """Rings inwards from the edge of the lids: their thickness, then along the ball out of sight."""
+    """Rings inwards from the edge of the lids: their thickness, then along the ball, unseen."""
     out = points.copy()
     edge = out[slit.rings[0]] - ball
     middle = edge.mean(axis=0)

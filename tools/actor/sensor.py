@@ -1,4 +1,4 @@
-"""The sensor behind each simulated lens: gain, exposure, vignetting, defocus, noise, quantisation."""
+"""The sensor behind each simulated lens: gain, vignetting, defocus, noise, quantisation."""
 
 from __future__ import annotations
 
@@ -100,6 +100,8 @@ def expose(radiance: Floats32, sensor: Sensor, key: tuple[int, str, int]) -> Ima
     )
     level = level + noise * spread
     if sensor.bits == 8:
-        return np.clip(np.rint(level), 0, 255).astype(np.uint8)
+        eight: Image = np.clip(np.rint(level), 0, 255).astype(np.uint8)
+        return eight
     top = 2**sensor.bits - 1
-    return np.clip(np.rint(level * (top / 255.0)), 0, top).astype(np.uint16)
+    deep: Image = np.clip(np.rint(level * (top / 255.0)), 0, top).astype(np.uint16)
+    return deep

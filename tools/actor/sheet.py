@@ -64,8 +64,9 @@ def contact_sheet(actor: ActorModel, size: int = 320) -> Image:
     """
     renderer = ActorRenderer(actor)
     middle, face = np.array([0.0, -8.0, 20.0]), np.array([0.0, -22.0, 80.0])
-    close = ((0.0, 1.9, face), (30.0, 1.9, face), (20.0, 4.5, np.array([29.0, 10.0, 75.0])),
-             (15.0, 4.0, np.array([0.0, -50.0, 90.0])), (40.0, 4.0, np.array([45.0, -20.0, 60.0])))  # fmt: skip
+    eye, lips, cheek = np.array([[29.0, 10.0, 75.0], [0.0, -50.0, 90.0], [45.0, -20.0, 60.0]])
+    close = ((0.0, 1.9, face), (30.0, 1.9, face), (20.0, 4.5, eye), (15.0, 4.0, lips),
+             (40.0, 4.0, cheek))  # fmt: skip
     tiles = []
     for azimuth, elevation in _VIEWS:
         tiles.append(_tile(renderer, {}, camera_at(middle, azimuth, elevation, size), ""))

@@ -95,7 +95,7 @@ def _hollows(lattice: Lattice, points: Floats, normals: Floats) -> Floats:
     smooth = points
     for steps, depth in ((6, 0.9), (20, 3.2)):
         for _ in range(steps):
-            smooth = mean @ smooth
+            smooth = np.asarray(mean @ smooth)
         rise = ((smooth - points) * normals).sum(axis=1)
         shade *= 1.0 - 0.26 * np.tanh(np.clip(rise, 0.0, None) / depth)
     result: Floats = np.where(lattice.ring == 0, shade, 1.0)
@@ -138,7 +138,7 @@ def _hairline(points: Floats) -> Floats:
 
 @lru_cache(maxsize=4)
 def make_tile(seed: int, freckles: float) -> Floats32:
-    """Fine detail that tiles, `TILE_MM` a side: pores, mottling, freckles, wrinkles, strands of hair.
+    """Fine detail that tiles, `TILE_MM` a side: pores, mottling, freckles, strands of hair.
 
     Args:
         seed: equal seeds give the same tile.

@@ -25,13 +25,14 @@ def write_truth(
 
     ::
 
-        FOLDER/truth.npz         vertices (F,V,3) float32 world mm, faces (P,4), weights (F,B), names (B),
-                                 R (F,3,3) and t (F,3) world_from_head, landmarks68 (68), face_region,
-                                 surface (F,Vp,3) eyes and teeth, surface_tri (T,3) over skin then
-                                 surface, rigid_vertices, lid_pairs, lip_pairs, t_ns (F)
+        FOLDER/truth.npz         vertices (F,V,3) float32 world mm, faces (P,4), weights (F,B),
+                                 names (B), R (F,3,3) and t (F,3) world_from_head,
+                                 landmarks68 (68), face_region, surface (F,Vp,3) eyes and teeth,
+                                 surface_tri (T,3) over skin then surface, rigid_vertices,
+                                 lid_pairs, lip_pairs, t_ns (F)
         FOLDER/cameras.json      the true cameras
-        FOLDER/depth_0000.npz    for chosen frames: camera-space Z (H,W) float32 mm by camera name, 0
-                                 where there is no actor
+        FOLDER/depth_0000.npz    for chosen frames: camera-space Z (H,W) float32 mm by camera
+                                 name, 0 where there is no actor
 
     Args:
         folder: the truth folder of the take.

@@ -77,4 +77,5 @@ def _cheek_puff(field: Field) -> Floats:
     outer = (field.lattice.ring == 0) * smooth_step(5.0, 35.0, field.z)
     cheek = outer * bump((field.wide - 45.0) / 17.0, (field.y + 47.0) / 20.0)
     lip = outer * bump(field.x / 22.0, (field.y + 45.0) / 8.0) * smooth_step(-57.0, -50.0, field.y)
-    return field.normals * (9.0 * cheek + 2.2 * lip)[:, None]
+    puffed: Floats = field.normals * (9.0 * cheek + 2.2 * lip)[:, None]
+    return puffed

@@ -53,6 +53,12 @@ class _Page(HTMLParser):
         self.words.append(data)
 
 
+def _errors(count: int) -> np.ndarray:
+    errors = np.full((cases.FRAMES, count), 0.3)
+    errors[:, :5] = np.nan  # untold
+    return errors
+
+
 def _read(path: Path) -> tuple[_Page, str]:
     text = path.read_text(encoding="utf-8")
     page = _Page(text)
@@ -67,7 +73,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> ReportInputs:
     performance = cases.track(take)
     count = cases.scan(take)
     errors = TakeErrors(
-        track_mm=np.full(performance.vertices.shape[:2], 0.3),
+        track_mm=_errors(performance.vertices.shape[1]),
         scan_mm={1: np.full(count, 0.1)},
     )
     return ReportInputs(

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from capture.arrays import Floats
 from tools.report.charts import Labels, Series, line_chart
 from tools.report.inputs import ReportInputs, TakeInputs
 from tools.report.page import Section, Verdict, facts, figure, folded
@@ -36,7 +37,7 @@ def quality_section(inputs: ReportInputs) -> list[Section]:
             _series_chart(name, frames, values)
             for name, values in per_frame(item.track_report, len(frames)).items()
         ]
-        if item.errors is not None and item.errors.track_mm is not None:
+        if told_errors(item).size:
             charts.insert(0, _error_chart(item, frames))
         parts += charts[:_OPEN]
         if len(charts) > _OPEN:
@@ -48,6 +49,15 @@ def quality_section(inputs: ReportInputs) -> list[Section]:
     return [
         Section(anchor="quality", title="Tracking quality", body=body, verdicts=tuple(verdicts))
     ]
+
+
+def told_errors(item: TakeInputs) -> Floats:
+    """Errors (F, N) mm of the vertices whose truth is told at every frame; empty when of none."""
+    if item.errors is None or item.errors.track_mm is None:
+        return np.zeros((0, 0))
+    errors = np.asarray(item.errors.track_mm, dtype=np.float64)
+    told: Floats = errors[:, np.isfinite(errors).all(axis=0)]
+    return told
 
 
 def per_frame(report: Mapping[str, Any], count: int) -> dict[str, list[float]]:
@@ -72,10 +82,12 @@ def per_frame(report: Mapping[str, Any], count: int) -> dict[str, list[float]]:
     }
 
 
-def unit_of(name: str) -> str:
-    """The unit that a name ends in, as ` (mm)`, or nothing."""
-    last = name.rsplit("_", 1)[-1]
-    return f" ({last})" if last in _UNITS and last != name else ""
+def spoken(name: str) -> str:
+    """A name of a report as words, its unit behind a comma: `residual_px` is `residual, px`."""
+    words = name.replace(".", ", ").split("_")
+    if len(words) > 1 and words[-1] in _UNITS:
+        return f"{' '.join(words[:-1])}, {words[-1]}"
+    return " ".join(words)
 
 
 def _rank(name: str) -> int:
@@ -127,17 +139,17 @@ def _confidence_chart(performance: Performance, frames: list[float]) -> str:
 
 
 def _series_chart(name: str, frames: list[float], values: list[float]) -> str:
-    words = name.replace("_", " ").replace(".", ", ")
+    words = spoken(name)
     labels = Labels(title=words, x="frame", y=words)
     chart = line_chart([Series(name=name, x=frames, y=values)], labels, height=150.0)
-    return figure(chart, f"{words}{unit_of(name)}, as the tracker reports it.")
+    return figure(chart, f"{words[:1].upper()}{words[1:]}, as the tracker reports it.")
 
 
 def _error_chart(item: TakeInputs, frames: list[float]) -> str:
-    errors = np.asarray(item.errors.track_mm if item.errors is not None else 0.0)
+    errors = told_errors(item)
     series = [
-        Series(name="RMS", x=frames, y=np.sqrt(np.nanmean(errors**2, axis=1)).tolist()),
-        Series(name="95th percentile", x=frames, y=np.nanpercentile(errors, 95, axis=1).tolist()),
+        Series(name="RMS", x=frames, y=np.sqrt((errors**2).mean(axis=1)).tolist()),
+        Series(name="95th percentile", x=frames, y=np.percentile(errors, 95, axis=1).tolist()),
     ]
     labels = Labels(title="error against the truth", x="frame", y="error, mm")
     chart = line_chart(series, labels, limit=(_GOOD_RMS_MM, f"goal {_GOOD_RMS_MM} mm RMS"))
@@ -150,9 +162,10 @@ def _verdict(item: TakeInputs, performance: Performance) -> Verdict:
     if lost:
         words = f"{len(lost)} frames were lost, the first of them {lost[0]}"
         return Verdict(level="bad", subject=subject, words=words)
-    if item.errors is not None and item.errors.track_mm is not None:
-        rms = float(np.sqrt(np.nanmean(item.errors.track_mm**2)))
-        last = float(np.sqrt(np.nanmean(item.errors.track_mm[-1] ** 2)))
+    errors = told_errors(item)
+    if errors.size:
+        rms = float(np.sqrt((errors**2).mean()))
+        last = float(np.sqrt((errors[-1] ** 2).mean()))
         level = "good" if rms <= _GOOD_RMS_MM else "warn" if rms <= _FAIR_RMS_MM else "bad"
         words = (
             f"RMS {number(rms)} mm from the truth over all frames, {number(last)} mm at the last"

@@ -12,13 +12,14 @@ from recon.mesh import Mesh, vertex_normals
 from tools.report.picture import Pixels
 from track.raster import Rasterizer
 
-_SKIN = np.array([0.80, 0.74, 0.70])
+_SKIN = np.array([0.80, 0.74, 0.70], np.float32)
 _BACKGROUND = 1.0
 _OVERSAMPLE = 2
 _FAR = 12.0  # distance of the studio camera in mesh radii: nearly orthographic
 # directions to the lights in camera space (+X right, +Y down, +Z forward), and their strengths
 _LIGHTS = (((-0.55, -0.65, -0.6), 0.62), ((0.75, -0.1, -0.55), 0.30), ((0.2, 0.9, -0.2), 0.10))
 _AMBIENT = 0.16
+_HALFWAY = np.array([-0.3, -0.36, -1.0])  # between the key light and the camera
 
 
 class Studio:
@@ -31,6 +32,8 @@ class Studio:
     def __init__(self, mesh: Mesh) -> None:
         self.mesh = mesh
         self._rasterizer = Rasterizer(mesh.triangles, len(mesh.vertices))
+        self._of: Floats | None = None  # whose normals are kept: one mesh is often drawn many times
+        self._normals: Floats32 = np.zeros((0, 3), np.float32)
 
     def portrait(self, vertices: Floats, camera: Camera, colours: Floats | None = None) -> Pixels:
         """The shaded mesh on white.
@@ -83,19 +86,27 @@ class Studio:
         buffers = self._rasterizer.render(camera, vertices)
         seen: Bools = buffers.triangle >= 0
         corners = self.mesh.triangles[buffers.triangle[seen]]
-        share = buffers.barycentric[seen].astype(np.float64)
-        normals = np.nan_to_num(vertex_normals(vertices, self.mesh.triangles))
-        local = np.einsum("nk,nkc->nc", share, normals[corners])
-        local = local @ camera.camera_from_world.rotation.T
-        local /= np.maximum(np.linalg.norm(local, axis=1, keepdims=True), 1e-9)
-        local *= np.where(local[:, 2:] > 0, -1.0, 1.0)  # both sides are lit
-        albedo = _SKIN if colours is None else np.einsum("nk,nkc->nc", share, colours[corners])
-        light = np.full(len(local), _AMBIENT)
+        share = buffers.barycentric[seen]
+        if self._of is not vertices:  # callers draw an array, they do not change it in between
+            self._of = vertices
+            normals = vertex_normals(vertices, self.mesh.triangles)
+            self._normals = np.nan_to_num(normals).astype(np.float32)
+        local = np.einsum("nk,nkc->nc", share, self._normals[corners])
+        local = local @ camera.camera_from_world.rotation.T.astype(np.float32)
+        local /= np.sqrt(np.maximum((local**2).sum(axis=1, keepdims=True), 1e-18))
+        local[local[:, 2] > 0] *= -1.0  # both sides are lit
+        albedo = (
+            _SKIN
+            if colours is None
+            else np.einsum("nk,nkc->nc", share, colours.astype(np.float32)[corners])
+        )
+        light = np.full(len(local), _AMBIENT, np.float32)
         for direction, strength in _LIGHTS:
-            unit = np.array(direction) / np.linalg.norm(direction)
+            unit = (np.array(direction) / np.linalg.norm(direction)).astype(np.float32)
             light += strength * np.maximum(local @ unit, 0.0)
-        half = np.array([-0.3, -0.36, -1.0]) / np.linalg.norm([-0.3, -0.36, -1.0])
-        shine = 0.10 * np.maximum(local @ half, 0.0) ** 24
+        half = (_HALFWAY / np.linalg.norm(_HALFWAY)).astype(np.float32)
+        facing = np.maximum(local @ half, 0.0) ** 8
+        shine = 0.10 * facing * facing * facing
         picture = np.zeros((camera.height, camera.width, 3), np.float32)
         picture[seen] = np.clip((albedo * light[:, None] + shine[:, None]) ** (1 / 1.35), 0.0, 1.0)
         return picture, seen

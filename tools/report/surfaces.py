@@ -28,7 +28,7 @@ from tools.report.shade import Studio, cropped, enlarged, studio_camera
 from tools.report.svg import escape, number
 from track.performance import Performance
 
-_SCANS = 3  # a take
+_SCANS, _FRAMES = 12, 16  # at most about so many of all takes together, at least one of each
 _PORTRAIT = 330  # px
 _PLATE = 440  # px
 _ERROR_MM = 1.0  # the dark end of error colours
@@ -50,7 +50,7 @@ def scan_section(inputs: ReportInputs) -> list[Section]:
     parts: list[str] = []
     verdicts: list[Verdict] = []
     for item in inputs.takes:
-        for scan in _spread(item.scans, _SCANS):
+        for scan in _spread(item.scans, max(1, min(3, _SCANS // len(inputs.takes)))):
             surface = read_ply(scan.path)
             parts.append(f"<h3>{escape(item.take.name)}, frame {scan.frame}</h3>")
             parts.append(facts(_scan_facts(scan, surface)))
@@ -70,6 +70,7 @@ def scan_section(inputs: ReportInputs) -> list[Section]:
 def overlay_section(inputs: ReportInputs) -> list[Section]:
     """The tracked mesh over plates of several frames and views, and neutral beside expression."""
     parts: list[str] = []
+    most = max(1, _FRAMES // max(1, len(inputs.takes)))
     for item in inputs.takes:
         if item.performance is None or item.cameras is None:
             continue
@@ -78,7 +79,7 @@ def overlay_section(inputs: ReportInputs) -> list[Section]:
         studio = Studio(Mesh(first, performance.polygons))
         parts.append(f"<h3>{escape(item.take.name)}</h3>")
         views = front_views(item.cameras, first)
-        for index in key_frames(performance):
+        for index in sorted(key_frames(performance)[:most]):
             parts.append(_overlays(item, performance, studio, index, views))
         parts.append(_expression(performance, studio))
     if not parts:
@@ -87,12 +88,12 @@ def overlay_section(inputs: ReportInputs) -> list[Section]:
 
 
 def key_frames(performance: Performance) -> list[int]:
-    """Indices of frames worth seeing: first, peak expression, least confident, last."""
+    """Indices of frames worth seeing, best first: peak expression, last, least confident, first."""
     moved = stilled(performance) - performance.vertices[0]
     motion = np.sqrt((moved**2).sum(axis=2).mean(axis=1))
     doubt = performance.confidence.mean(axis=1)
-    wanted = [0, int(motion.argmax()), int(doubt.argmin()), len(performance.vertices) - 1]
-    return sorted(set(wanted))
+    wanted = [int(motion.argmax()), len(performance.vertices) - 1, int(doubt.argmin()), 0]
+    return list(dict.fromkeys(wanted))
 
 
 def stilled(performance: Performance) -> Floats:

@@ -162,6 +162,8 @@ class Session:
         """All takes, slates in order of name and takes in order of number."""
         found: list[tuple[str, int, Path, dict[str, Any]]] = []
         for folder in sorted((self.folder / "takes").glob("*/take.json")):
+            if folder.parent.name.startswith("."):  # what a killed recording left behind
+                continue
             remarks = dict(Take.open(folder.parent).manifest.remarks)
             if "shot" in remarks and "take_number" in remarks:
                 found.append(

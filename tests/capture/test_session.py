@@ -96,6 +96,14 @@ def test_a_retake_gets_the_next_number_and_supersedes(tmp_path: Path) -> None:
         session.take("frown")
 
 
+def test_what_a_killed_recording_left_is_no_take(tmp_path: Path) -> None:
+    session = Session.create(tmp_path / "s")
+    take = record_take(session, SMILE, array_of(), RecordSettings())
+    take.folder.rename(take.folder.with_name(".partial-77-smile_001"))
+    assert session.takes() == ()
+    assert session.next_number("smile") == 1
+
+
 def test_the_same_array_and_shot_give_the_same_bytes(tmp_path: Path) -> None:
     contents = []
     for name in ("a", "b"):

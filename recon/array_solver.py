@@ -31,6 +31,7 @@ class CalibrateSettings:
         min_corners: views with fewer corners are refused.
         max_blur_px: views with wider edges (standard deviation, px) are refused.
         still_px: frames where no corner moved by more than this since the last are left out.
+        max_poses: of more board poses, so many are used, evenly spread over the take.
         least_views: a device that used the board in fewer frames is refused.
         least_poses: a take with fewer board poses is refused.
         loss_px: scale of the Cauchy loss.
@@ -44,6 +45,7 @@ class CalibrateSettings:
     min_corners: int = 6
     max_blur_px: float = 3.0
     still_px: float = 0.5
+    max_poses: int = 60
     least_views: int = 4
     least_poses: int = 5
     loss_px: float = 0.5
@@ -55,6 +57,7 @@ class CalibrateSettings:
     def __post_init__(self) -> None:
         ranges: dict[str, tuple[float, float]] = {
             "min_corners": (4, 1000), "max_blur_px": (0.5, 100.0), "still_px": (0.0, 100.0),
+            "max_poses": (3, 10000),
             "least_views": (2, 10000), "least_poses": (3, 10000), "loss_px": (0.01, 100.0),
             "outlier_sigmas": (2.0, 100.0), "held_out": (0.0, 0.5),
         }  # fmt: skip
@@ -148,8 +151,10 @@ def solve_array(
     check_views(observations, settings)
     progress(0, _STAGES, "array")
     state = initial_state(observations, corners, settings.focal_guess)
-    rough = float(np.nanmedian(np.abs(state.residuals(observations))))
+    rough = _typical(state.residuals(observations))
     progress(1, _STAGES, "array")
+    if not np.isfinite(rough):
+        raise SolveError("no start was found that puts the board before the devices that saw it")
     wide = AdjustOptions(loss_px=max(settings.loss_px, _NORMAL_MAD * rough))
     state = adjust_array(state, observations, wide).state
     progress(2, _STAGES, "array")
@@ -258,13 +263,19 @@ def _inliers(
     """Which residuals lie within the robust limit of their device, and the sigma of the array."""
     residuals = state.residuals(observations)
     size = np.linalg.norm(residuals, axis=1)
-    whole = _NORMAL_MAD * float(np.nanmedian(np.abs(residuals)))
+    whole = _NORMAL_MAD * _typical(residuals)
     limit = np.empty(len(observations))
     for device in range(len(observations.device_names)):
         rows = observations.device == device
-        own = _NORMAL_MAD * float(np.nanmedian(np.abs(residuals[rows])))
+        own = _NORMAL_MAD * _typical(residuals[rows])
         limit[rows] = sigmas * max(min(own, 3.0 * whole), _LEAST_SIGMA_PX)
     return size <= limit, whole
+
+
+def _typical(residuals: Floats) -> float:
+    """Median size of a coordinate, px; infinity when every corner fell behind its camera."""
+    finite = np.abs(residuals[np.isfinite(residuals)])
+    return float(np.median(finite)) if len(finite) else float("inf")
 
 
 def _held_out(

@@ -51,6 +51,7 @@ def calibrate(
         min_corners=settings.min_corners,
         max_blur_px=settings.max_blur_px,
         still_px=settings.still_px,
+        max_poses=settings.max_poses,
     )
     observations, tally = observe_board(take, board, limits, progress=progress)
     check_views(observations, settings, tally)

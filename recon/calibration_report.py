@@ -70,14 +70,8 @@ def calibration_report(
 
 
 def summary_of(report: Mapping[str, Any]) -> dict[str, Any]:
-    """The report without its long lists, to stand inside cameras.json."""
-    long = ("residual_vectors", "poses")
-    short = {key: value for key, value in report.items() if key not in long}
-    short["devices"] = [
-        {key: value for key, value in device.items() if key != "coverage"}
-        for device in report["devices"]
-    ]
-    return short
+    """The report without its residual vectors, to stand inside cameras.json."""
+    return {key: value for key, value in report.items() if key != "residual_vectors"}
 
 
 def _device(

@@ -21,6 +21,7 @@ ONE_LINE = "corners on one line"
 BLURRED = "blurred"
 LOST = "lost frame"
 STILL = "board had not moved"
+SPARE = "more poses than needed"
 USED = "used"
 _LINE = 0.5  # corners must spread by this much of a square across their main direction
 _BLUR_PATCHES = 16
@@ -55,11 +56,13 @@ class CornerLimits:
         min_corners: fewer corners than this are refused.
         max_blur_px: a wider edge (standard deviation of its spread, px) is refused.
         still_px: a frame where no corner moved by more than this since the last is left out.
+        max_poses: of more board poses than this, so many are used, evenly spread over the take.
     """
 
     min_corners: int = 6
     max_blur_px: float = 3.0
     still_px: float = 0.5
+    max_poses: int = 60
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,13 +200,24 @@ def observe_board(
                     views[name] = view
             tally[name][reason] = tally[name].get(reason, 0) + 1
         if views and poses and _still(poses[-1][1], views, limits.still_px):
-            for name in views:
-                tally[name][USED] -= 1
-                tally[name][STILL] = tally[name].get(STILL, 0) + 1
+            _move(tally, views, STILL)
         elif views:
             poses.append((frame, views))
         progress(done, len(take.frames), "corners")
-    return _collect(take, poses), tally
+    chosen = poses
+    if len(poses) > limits.max_poses:
+        places = np.linspace(0, len(poses) - 1, limits.max_poses).round().astype(int).tolist()
+        chosen = [poses[place] for place in places]
+        for _, spare in (pose for place, pose in enumerate(poses) if place not in set(places)):
+            _move(tally, spare, SPARE)
+    return _collect(take, chosen), tally
+
+
+def _move(tally: dict[str, dict[str, int]], views: Mapping[str, CornerView], reason: str) -> None:
+    """Count these used views under another reason."""
+    for name in views:
+        tally[name][USED] -= 1
+        tally[name][reason] = tally[name].get(reason, 0) + 1
 
 
 def _still(

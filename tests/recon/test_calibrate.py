@@ -22,6 +22,7 @@ from recon.array_world import array_world
 from recon.board_chain import initial_state
 from recon.calibrate import calibrate, report_path
 from recon.calibration_report import calibration_report, summary_of
+from recon.corners import CornerLimits, observe_board
 from recon.observations import BoardObservations
 from recon.visiting import import_take
 from tools.bench.board_scene import (
@@ -238,6 +239,9 @@ def test_the_stage_writes_cameras_report_and_record_once(tmp_path: Path) -> None
     report = json.loads(report_path(out).read_text(encoding="utf-8"))
     assert report["mean_reprojection_px"] < 0.1
     assert read_cameras(out).names == take.device_names
+    thinned, tally = observe_board(take, A4_BOARD, CornerLimits(max_poses=3))
+    assert thinned.frames == (0, 3, 6)
+    assert sum(counts.get("more poses than needed", 0) for counts in tally.values()) > 0
     take.set_cameras(cameras)
     before = out.read_bytes(), out.stat().st_mtime_ns
     steps: list[str] = []

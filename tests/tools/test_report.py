@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from html.parser import HTMLParser
 from pathlib import Path
@@ -9,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from capture.camera_file import write_cameras
 from capture.errors import InputError, TakeError
 from tests.tools import report_cases as cases
 from tools.report import (
@@ -154,8 +156,23 @@ def test_bare_take_shows_what_there_is(tmp_path: Path) -> None:
 
 def test_take_with_cameras_shows_the_array(tmp_path: Path) -> None:
     take = cases.make_take(tmp_path)
-    parsed, _ = _read(report_for_take(take.folder, tmp_path / "r.html"))
-    assert parsed.sections == ["layout", "capture"]
+    parsed, text = _read(report_for_take(take.folder, tmp_path / "r.html"))
+    assert parsed.sections == ["layout", "capture", "tracking"]
+    assert "the neutral, not yet tracked" in text
+    assert "confidence" not in text
+
+
+def test_whole_calibration_report_is_found_beside_the_cameras(tmp_path: Path) -> None:
+    take = cases.make_take(tmp_path)
+    full = json.loads(cases.calibration(tmp_path, []).read_text(encoding="utf-8"))
+    short = {key: full[key] for key in ("mean_reprojection_px", "held_out", "devices")}
+    write_cameras(tmp_path / "cameras.json", take.cameras(), short)
+    inputs = ReportInputs(title="x", calibration=tmp_path / "cameras.json")
+    assert inputs.calibration_report == full
+    other = dict(full, mean_reprojection_px=9.0)
+    (tmp_path / "report.json").write_text(json.dumps(other), encoding="utf-8")
+    inputs = ReportInputs(title="x", calibration=tmp_path / "cameras.json")
+    assert inputs.calibration_report == short, "of another calibration"
 
 
 def test_nothing_at_all_is_still_a_page(tmp_path: Path) -> None:

@@ -142,10 +142,15 @@ class ReportInputs:
         if self.calibration is None:
             return self.told
         document = json_object(self.calibration)
-        if "cameras" in document:  # a cameras.json, which may say nothing of how it came to be
-            inner = document.get("report")
-            return inner if isinstance(inner, dict) else {}
-        return document
+        if "cameras" not in document:
+            return document
+        inner = document.get("report")  # a cameras.json may say nothing of how it came to be
+        if not isinstance(inner, dict):
+            return {}
+        full = json_object(self.calibration.with_name("report.json"))
+        shared = [key for key in inner if key in full and key not in ("devices", "warnings")]
+        same = bool(shared) and all(full[key] == inner[key] for key in shared)
+        return full if same else inner  # the whole report has the long lists too
 
     @cached_property
     def face_rig(self) -> FaceRig | None:

@@ -72,7 +72,10 @@ def overlay_section(inputs: ReportInputs) -> list[Section]:
     parts: list[str] = []
     most = max(1, _FRAMES // max(1, len(inputs.takes)))
     for item in inputs.takes:
-        if item.performance is None or item.cameras is None:
+        if item.performance is None:
+            parts.append(_neutral_overlay(item))
+            continue
+        if item.cameras is None:
             continue
         performance = item.performance
         first = performance.vertices[0].astype(np.float64)
@@ -80,9 +83,11 @@ def overlay_section(inputs: ReportInputs) -> list[Section]:
         parts.append(f"<h3>{escape(item.take.name)}</h3>")
         views = front_views(item.cameras, first)
         for index in sorted(key_frames(performance)[:most]):
-            parts.append(_overlays(item, performance, studio, index, views))
+            frame = int(performance.frames[index])
+            vertices = performance.vertices[index].astype(np.float64)
+            parts.append(_overlays(item, studio, frame, vertices, views))
         parts.append(_expression(performance, studio))
-    if not parts:
+    if not any(parts):
         return []
     return [Section(anchor="tracking", title="Tracked mesh over plates", body="".join(parts))]
 
@@ -124,15 +129,19 @@ def front_views(array: CameraArray, vertices: Floats) -> list[Camera]:
     return [array[index] for index in chosen]
 
 
+def _neutral_overlay(item: TakeInputs) -> str:
+    """Before tracking: whether the neutral sits on the face at the first frame."""
+    if item.neutral is None or item.cameras is None:
+        return ""
+    vertices = item.neutral.vertices
+    views = front_views(item.cameras, vertices)
+    pictures = _overlays(item, Studio(item.neutral), item.take.frames[0], vertices, views)
+    return f"<h3>{escape(item.take.name)}: the neutral, not yet tracked</h3>{pictures}"
+
+
 def _overlays(
-    item: TakeInputs,
-    performance: Performance,
-    studio: Studio,
-    index: int,
-    views: Sequence[Camera],
+    item: TakeInputs, studio: Studio, frame: int, vertices: Floats, views: Sequence[Camera]
 ) -> str:
-    frame = int(performance.frames[index])
-    vertices = performance.vertices[index].astype(np.float64)
     figures = []
     for camera in views:
         if not item.take.present(camera.name, frame):

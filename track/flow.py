@@ -22,6 +22,9 @@ from track.reference import ReferenceLevel
 _FLAT = 1e-5  # variance of an image in 0..1 below which a window has no texture
 _MIN_PIXELS = 20
 _MAX_STEP_PX = 1.0
+_DONE_PX = 0.005
+_ALIGNED = 0.85  # correlation at which a sample needs no search: refinement will do
+_FAST = {"reassoc", "contract", "arcp", "nsz"}  # sums may be reordered: they fill vector lanes
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -51,6 +54,8 @@ def search_flow(
 ) -> FlowMatches:
     """Find the whole-pixel displacement of highest NCC within a square.
 
+    A sample that correlates by more than 0.85 where the guide puts it is not searched: it stays.
+
     Args:
         level: the reference of the view.
         view: the frame's image, guided into it.
@@ -65,7 +70,8 @@ def search_flow(
     check_shape(chosen=(chosen, "M"), samples=(level.samples, "M"))
     half = level.windows.shape[1] // 2
     displacement, correlation = _search(
-        level.image, view.image, view.solid, level.centres, level.windows, chosen, radius_px,
+        (level.image, level.gradient), view.image, view.solid, level.centres, level.windows,
+        chosen, radius_px,
         window_weights(half),
     )  # fmt: skip
     blank = np.zeros((len(displacement), 3))
@@ -99,7 +105,7 @@ def refine_flow(
     return FlowMatches(displacement=displacement, correlation=correlation, information=information)
 
 
-@numba.njit(cache=True, parallel=True)
+@numba.njit(cache=True, nogil=True)
 def _search(
     reference: Any,
     image: Any,
@@ -113,13 +119,21 @@ def _search(
     count, side = len(centres), windows.shape[1]
     best_shift = np.full((count, 2), np.nan)
     best_score = np.full(count, -1.0)
-    for n in numba.prange(count):
-        if not chosen[n]:
-            continue
+    patch = np.empty((4, side, _padded(side)), np.float32)
+    for n in range(count):
         x0, y0 = centres[n, 0] - side // 2, centres[n, 1] - side // 2
+        if not chosen[n] or not _inside(image, x0, y0, radius, patch):
+            continue
+        if not _template(reference, solid, windows[n], x0, y0, 0, 0, weights, patch):
+            continue
+        best_score[n] = _correlation(patch, image, x0, y0)
+        if best_score[n] > -1.0:
+            best_shift[n] = 0.0
+        if best_score[n] > _ALIGNED:
+            continue
         for dy in range(-radius, radius + 1):
             for dx in range(-radius, radius + 1):
-                score = _correlation(reference, image, solid, windows[n], x0, y0, dx, dy, weights)
+                score = _correlation(patch, image, x0 + dx, y0 + dy)
                 if score > best_score[n]:
                     best_score[n] = score
                     best_shift[n, 0], best_shift[n, 1] = dx, dy
@@ -127,51 +141,38 @@ def _search(
 
 
 @numba.njit(cache=True)
-def _correlation(
-    reference: Any,
-    image: Any,
-    solid: Any,
-    window: Any,
-    x0: int,
-    y0: int,
-    dx: int,
-    dy: int,
-    weights: Any,
-) -> float:
-    """Weighted NCC of one window at one whole-pixel shift; -1 when too little of it shows."""
-    height, width = image.shape
-    side = window.shape[0]
-    total = r1 = w1 = rr = ww = rw = 0.0
-    used = wanted = 0
-    for j in range(side):
-        v = y0 + j + dy
-        for i in range(side):
-            if window[j, i] == 0:
-                continue
-            wanted += 1
-            u = x0 + i + dx
-            if u < 0 or v < 0 or u >= width or v >= height or solid[v, u] == 0:
-                continue
-            g = weights[j, i]
-            r = reference[y0 + j, x0 + i]
-            w = image[v, u]
-            total += g
-            r1 += g * r
-            w1 += g * w
-            rr += g * r * r
-            ww += g * w * w
-            rw += g * r * w
-            used += 1
-    if used < _MIN_PIXELS or 2 * used < wanted:
-        return -1.0
-    r1, w1 = r1 / total, w1 / total
-    r_variance, w_variance = rr / total - r1 * r1, ww / total - w1 * w1
-    if r_variance < _FLAT or w_variance < _FLAT:
-        return -1.0
-    return (rw / total - r1 * w1) / np.sqrt(r_variance * w_variance)  # type: ignore[no-any-return]
+def _padded(side: int) -> int:
+    """Columns of a window's row in memory: a multiple of what the processor adds at once."""
+    return (side + 7) // 8 * 8
 
 
-@numba.njit(cache=True, parallel=True)
+@numba.njit(cache=True)
+def _inside(image: Any, x0: int, y0: int, margin: int, patch: Any) -> bool:
+    """Whether the padded window and a margin around it lie in the image."""
+    rows, columns = patch.shape[1], patch.shape[2]
+    across = x0 - margin >= 0 and x0 + columns + margin <= image.shape[1]
+    return across and y0 - margin >= 0 and y0 + rows + margin <= image.shape[0]
+
+
+@numba.njit(cache=True, fastmath=_FAST)
+def _correlation(patch: Any, image: Any, x0: int, y0: int) -> float:
+    """Weighted NCC of a template with the image at one whole-pixel place."""
+    mean = square = cross = np.float32(0.0)
+    for j in range(patch.shape[1]):
+        weight, value, row = patch[0, j], patch[1, j], image[y0 + j]
+        for i in range(patch.shape[2]):
+            w = row[x0 + i]
+            gw = weight[i] * w
+            mean += gw
+            square += gw * w
+            cross += gw * value[i]
+    variance = square - mean * mean
+    if variance < _FLAT:
+        return -1.0
+    return cross / np.sqrt(variance)  # type: ignore[no-any-return]
+
+
+@numba.njit(cache=True, nogil=True)
 def _refine(
     reference: Any,
     frame: Any,
@@ -186,35 +187,59 @@ def _refine(
     found = np.full((count, 2), np.nan)
     score = np.full(count, -1.0)
     information = np.zeros((count, 3))
-    for n in numba.prange(count):
+    width = _padded(side)
+    patch = np.empty((4, side, width), np.float32)  # weight, value, column and row gradient
+    scratch = np.empty((side + 3, width), np.float32), np.empty((side, width), np.float32)
+    for n in range(count):
         if not np.isfinite(start[n, 0]):
             continue
         x0, y0 = centres[n, 0] - side // 2, centres[n, 1] - side // 2
-        dx, dy = start[n]
-        patch = np.empty((4, side, side), np.float32)  # weight, value, column and row gradient
-        if not _template(reference, solid, windows[n], x0, y0, dx, dy, weights, patch):
+        ix, iy = int(np.rint(start[n, 0])), int(np.rint(start[n, 1]))
+        if not _template(reference, solid, windows[n], x0, y0, ix, iy, weights, patch):
             continue
-        xx, xy, yy = _hessian(patch)
-        determinant = xx * yy - xy * xy
-        if determinant < 1e-8:
-            continue
-        values = np.empty((side, side), np.float32)
-        lines = np.empty((side + 3, side), np.float32)
-        for step in range(iterations + 1):
-            if not _shifted(image, x0, y0, dx, dy, lines, values):
-                score[n] = -1.0
-                break
-            score[n], bx, by = _residual(patch, values)
-            if score[n] <= -1.0 or step == iterations:
-                break
-            sx = (xy * by - yy * bx) / determinant
-            sy = (xy * bx - xx * by) / determinant
-            long = max(abs(sx), abs(sy), _MAX_STEP_PX) / _MAX_STEP_PX
-            dx, dy = dx + sx / long, dy + sy / long
-        if score[n] > -1.0:
-            found[n, 0], found[n, 1] = dx, dy
-            information[n, 0], information[n, 1], information[n, 2] = xx, xy, yy
+        score[n] = _descend(
+            image, patch, scratch, (x0, y0), start[n], iterations, found[n], information[n]
+        )
+        if score[n] <= -1.0:
+            found[n] = np.nan
     return found, score, information
+
+
+@numba.njit(cache=True)
+def _descend(
+    image: Any,
+    patch: Any,
+    scratch: Any,
+    corner: Any,
+    start: Any,
+    iterations: int,
+    found: Any,
+    information: Any,
+) -> float:
+    """Gauss-Newton from `start`; fills `found` and `information` and returns the NCC."""
+    lines, values = scratch
+    xx, xy, yy = _hessian(patch)
+    determinant = xx * yy - xy * xy
+    if determinant < 1e-8:
+        return -1.0
+    dx, dy = start[0], start[1]
+    score = -1.0
+    for step in range(iterations + 1):
+        if not _shifted(image, corner[0], corner[1], dx, dy, lines, values):
+            return -1.0
+        score, bx, by = _residual(patch, values)
+        if score <= -1.0 or step == iterations:
+            break
+        sx = (xy * by - yy * bx) / determinant
+        sy = (xy * bx - xx * by) / determinant
+        size = max(abs(sx), abs(sy))
+        long = max(size, _MAX_STEP_PX) / _MAX_STEP_PX
+        dx, dy = dx + sx / long, dy + sy / long
+        if size < _DONE_PX:
+            break
+    found[0], found[1] = dx, dy
+    information[0], information[1], information[2] = xx, xy, yy
+    return score
 
 
 @numba.njit(cache=True)
@@ -224,8 +249,8 @@ def _template(
     window: Any,
     x0: int,
     y0: int,
-    dx: float,
-    dy: float,
+    ix: int,
+    iy: int,
     weights: Any,
     patch: Any,
 ) -> bool:
@@ -233,128 +258,122 @@ def _template(
     image, gradient = reference
     height, width = image.shape
     side = window.shape[0]
-    ix, iy = int(np.rint(dx)), int(np.rint(dy))
     total = mean = 0.0
     used = wanted = 0
+    patch[:] = 0.0
     for j in range(side):
         for i in range(side):
-            patch[0, j, i] = patch[1, j, i] = patch[2, j, i] = patch[3, j, i] = 0.0
             if window[j, i] == 0:
                 continue
             wanted += 1
             u, v = x0 + i + ix, y0 + j + iy
-            if u < 1 or v < 1 or u >= width - 1 or v >= height - 1:
-                continue
-            if solid[v, u - 1] + solid[v, u + 1] + solid[v - 1, u] + solid[v + 1, u] < 4:
+            if u < 0 or v < 0 or u >= width or v >= height or solid[v, u] == 0:
                 continue
             patch[0, j, i] = weights[j, i]
             patch[1, j, i] = image[y0 + j, x0 + i]
             patch[2, j, i] = gradient[0, y0 + j, x0 + i]
             patch[3, j, i] = gradient[1, y0 + j, x0 + i]
-            total += patch[0, j, i]
-            mean += patch[0, j, i] * patch[1, j, i]
+            total += weights[j, i]
+            mean += weights[j, i] * image[y0 + j, x0 + i]
             used += 1
     if used < _MIN_PIXELS or 2 * used < wanted:
         return False
-    mean /= total
-    return _normalise(patch, total, mean)  # type: ignore[no-any-return]
+    return _normalise(patch, np.float32(total), np.float32(mean / total))  # type: ignore[no-any-return]
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, fastmath=_FAST)
 def _normalise(patch: Any, total: float, mean: float) -> bool:
     """Make weights sum to 1, values zero-mean and unit; take mean and gain out of the gradients."""
-    side = patch.shape[1]
-    variance = gx = gy = 0.0
-    for j in range(side):
-        for i in range(side):
-            patch[0, j, i] /= total
-            g = patch[0, j, i]
-            patch[1, j, i] -= mean
-            variance += g * patch[1, j, i] ** 2
+    rows, columns = patch.shape[1], patch.shape[2]
+    variance = gx = gy = hx = hy = np.float32(0.0)
+    share = np.float32(1.0) / total
+    for j in range(rows):
+        for i in range(columns):
+            g = patch[0, j, i] * share
+            value = patch[1, j, i] - mean
+            patch[0, j, i], patch[1, j, i] = g, value
+            variance += g * value * value
             gx += g * patch[2, j, i]
             gy += g * patch[3, j, i]
+            hx += g * value * patch[2, j, i]
+            hy += g * value * patch[3, j, i]
     if variance < _FLAT:
         return False
-    deviation = np.sqrt(variance)
-    hx = hy = 0.0
-    for j in range(side):
-        for i in range(side):
-            g = patch[0, j, i]
-            patch[1, j, i] /= deviation
-            patch[2, j, i] = (patch[2, j, i] - gx) / deviation
-            patch[3, j, i] = (patch[3, j, i] - gy) / deviation
-            hx += g * patch[1, j, i] * patch[2, j, i]
-            hy += g * patch[1, j, i] * patch[3, j, i]
-    for j in range(side):
-        for i in range(side):
-            patch[2, j, i] -= hx * patch[1, j, i]
-            patch[3, j, i] -= hy * patch[1, j, i]
+    gain = np.float32(1.0) / np.float32(np.sqrt(variance))
+    hx, hy = hx * gain * gain, hy * gain * gain
+    for j in range(rows):
+        for i in range(columns):
+            value = patch[1, j, i]
+            patch[2, j, i] = (patch[2, j, i] - gx - hx * value) * gain
+            patch[3, j, i] = (patch[3, j, i] - gy - hy * value) * gain
+            patch[1, j, i] = value * gain
     return True
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, fastmath=_FAST)
 def _hessian(patch: Any) -> tuple[float, float, float]:
-    xx = xy = yy = 0.0
+    xx = xy = yy = np.float32(0.0)
     for j in range(patch.shape[1]):
+        weight, across, along = patch[0, j], patch[2, j], patch[3, j]
         for i in range(patch.shape[2]):
-            g = patch[0, j, i]
-            xx += g * patch[2, j, i] * patch[2, j, i]
-            xy += g * patch[2, j, i] * patch[3, j, i]
-            yy += g * patch[3, j, i] * patch[3, j, i]
-    return xx, xy, yy
+            xx += weight[i] * across[i] * across[i]
+            xy += weight[i] * across[i] * along[i]
+            yy += weight[i] * along[i] * along[i]
+    return float(xx), float(xy), float(yy)
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, fastmath=_FAST)
 def _shifted(image: Any, x0: int, y0: int, dx: float, dy: float, lines: Any, values: Any) -> bool:
     """The window of `image` at a fractional shift, Catmull-Rom; False outside the image."""
     height, width = image.shape
-    side = values.shape[0]
+    rows, columns = values.shape
     ix, iy = int(np.floor(dx)), int(np.floor(dy))
     left, top = x0 + ix - 1, y0 + iy - 1
-    if left < 0 or top < 0 or left + side + 3 > width or top + side + 3 > height:
+    if left < 0 or top < 0 or left + columns + 3 > width or top + rows + 3 > height:
         return False
-    t = np.float32(dx - ix)
-    a0 = np.float32(((-0.5 * t + 1.0) * t - 0.5) * t)
-    a1 = np.float32((1.5 * t - 2.5) * t * t + 1.0)
-    a2 = np.float32(((-1.5 * t + 2.0) * t + 0.5) * t)
-    a3 = np.float32((0.5 * t - 0.5) * t * t)
-    for j in range(side + 3):
-        row = image[top + j]
-        for i in range(side):
+    a0, a1, a2, a3 = _cubic(np.float32(dx - ix))
+    for j in range(rows + 3):
+        row, line = image[top + j], lines[j]
+        for i in range(columns):
             k = left + i
-            lines[j, i] = a0 * row[k] + a1 * row[k + 1] + a2 * row[k + 2] + a3 * row[k + 3]
-    t = np.float32(dy - iy)
-    a0 = np.float32(((-0.5 * t + 1.0) * t - 0.5) * t)
-    a1 = np.float32((1.5 * t - 2.5) * t * t + 1.0)
-    a2 = np.float32(((-1.5 * t + 2.0) * t + 0.5) * t)
-    a3 = np.float32((0.5 * t - 0.5) * t * t)
-    for j in range(side):
-        for i in range(side):
-            values[j, i] = (
-                a0 * lines[j, i]
-                + a1 * lines[j + 1, i]
-                + a2 * lines[j + 2, i]
-                + a3 * lines[j + 3, i]
-            )
+            line[i] = a0 * row[k] + a1 * row[k + 1] + a2 * row[k + 2] + a3 * row[k + 3]
+    a0, a1, a2, a3 = _cubic(np.float32(dy - iy))
+    for j in range(rows):
+        one, two, three, four = lines[j], lines[j + 1], lines[j + 2], lines[j + 3]
+        line = values[j]
+        for i in range(columns):
+            line[i] = a0 * one[i] + a1 * two[i] + a2 * three[i] + a3 * four[i]
     return True
 
 
 @numba.njit(cache=True)
+def _cubic(t: Any) -> tuple[Any, Any, Any, Any]:
+    """Catmull-Rom weights of the four neighbours at fraction t, float32."""
+    half, one, two = np.float32(0.5), np.float32(1.0), np.float32(2.0)
+    return (
+        ((-half * t + one) * t - half) * t,
+        (one + half) * t * t * t - (two + half) * t * t + one,
+        ((-(one + half) * t + two) * t + half) * t,
+        (half * t - half) * t * t,
+    )
+
+
+@numba.njit(cache=True, fastmath=_FAST)
 def _residual(patch: Any, values: Any) -> tuple[float, float, float]:
     """NCC, and the steepest descent images times the normalised difference."""
-    side = patch.shape[1]
-    mean = square = cross = bx = by = 0.0
-    for j in range(side):
-        for i in range(side):
-            g = patch[0, j, i]
-            w = values[j, i]
-            mean += g * w
-            square += g * w * w
-            cross += g * w * patch[1, j, i]
-            bx += g * w * patch[2, j, i]
-            by += g * w * patch[3, j, i]
+    mean = square = cross = bx = by = np.float32(0.0)
+    for j in range(patch.shape[1]):
+        weight, value, across, along = patch[0, j], patch[1, j], patch[2, j], patch[3, j]
+        line = values[j]
+        for i in range(patch.shape[2]):
+            gw = weight[i] * line[i]
+            mean += gw
+            square += gw * line[i]
+            cross += gw * value[i]
+            bx += gw * across[i]
+            by += gw * along[i]
     variance = square - mean * mean
     if variance < _FLAT:
         return -1.0, 0.0, 0.0
     deviation = np.sqrt(variance)  # gradients hold neither mean nor gain: no other term is left
-    return cross / deviation, bx / deviation, by / deviation
+    return float(cross / deviation), float(bx / deviation), float(by / deviation)

@@ -25,10 +25,11 @@ class GuidedView:
     """A frame's image brought into the reference image of its view.
 
     Attributes:
-        image: (H, W) float32; 0 where `solid` is 0.
+        image: (H, W) float32; the reference's own where `solid` is 0.
         place: (H, W, 2) float32 px, where each reference pixel's surface point is in the frame;
             NaN off the surface.
-        solid: (H, W) uint8, 1 where the point is in the frame's image and not occluded.
+        solid: (H, W) uint8, 1 where the point and its four neighbours are in the frame's image
+            and not occluded.
     """
 
     image: Floats32
@@ -62,7 +63,15 @@ def guided_view(
     pixels, depth = _drawn(level.camera, vertices)
     depths, scale = occluders if occluders is not None else (np.zeros((0, 0), np.float32), 1.0)
     warped, place, solid = _warp(
-        level.triangle, level.barycentric, triangles, pixels, depth, image, depths, scale
+        level.triangle,
+        level.barycentric,
+        triangles,
+        pixels,
+        depth,
+        image,
+        level.image,
+        depths,
+        scale,
     )
     return GuidedView(image=warped, place=place, solid=solid)
 
@@ -72,18 +81,7 @@ def _drawn(camera: Camera, vertices: Floats) -> tuple[Floats, Floats]:
     return pixels, depth
 
 
-@numba.njit(cache=True, inline="always")
-def _cubic(t: float) -> tuple[float, float, float, float]:
-    """Catmull-Rom weights of the four neighbours at fraction t."""
-    return (
-        ((-0.5 * t + 1.0) * t - 0.5) * t,
-        (1.5 * t - 2.5) * t * t + 1.0,
-        ((-1.5 * t + 2.0) * t + 0.5) * t,
-        (0.5 * t - 0.5) * t * t,
-    )
-
-
-@numba.njit(cache=True, parallel=True)
+@numba.njit(cache=True, nogil=True)
 def _warp(
     ids: Any,
     weights: Any,
@@ -91,43 +89,63 @@ def _warp(
     pixels: Any,
     depth: Any,
     image: Any,
+    reference: Any,
     occluders: Any,
     scale: float,
 ) -> tuple[Any, Any, Any]:
     height, width = ids.shape
     rows, columns = image.shape
-    out = np.zeros((height, width), np.float32)
-    place = np.full((height, width, 2), np.nan, np.float32)
-    solid = np.zeros((height, width), np.uint8)
-    for y in numba.prange(height):
+    out = reference.copy()
+    place = np.empty((height, width, 2), np.float32)
+    shown = np.zeros((height, width), np.uint8)
+    for y in range(height):
         for x in range(width):
+            place[y, x, 0] = place[y, x, 1] = np.nan
             if ids[y, x] < 0:
                 continue
-            u = v = total = 0.0
-            for k in range(3):
-                corner = triangles[ids[y, x], k]
-                share = weights[y, x, k] * depth[corner]
-                u += share * pixels[corner, 0]
-                v += share * pixels[corner, 1]
-                total += share
-            u, v = u / total, v / total
+            corner = triangles[ids[y, x]]
+            a, b, c = corner[0], corner[1], corner[2]
+            wa = weights[y, x, 0] * depth[a]
+            wb = weights[y, x, 1] * depth[b]
+            wc = weights[y, x, 2] * depth[c]
+            total = wa + wb + wc
+            u = (wa * pixels[a, 0] + wb * pixels[b, 0] + wc * pixels[c, 0]) / total
+            v = (wa * pixels[a, 1] + wb * pixels[b, 1] + wc * pixels[c, 1]) / total
             if not (1.0 <= u < columns - 2.0 and 1.0 <= v < rows - 2.0):
                 continue
             place[y, x, 0], place[y, x, 1] = u, v
             if occluders.size > 0 and _hidden(u / scale, v / scale, total, occluders):
                 continue
-            left, top = int(u), int(v)
-            a = _cubic(u - left)
-            b = _cubic(v - top)
-            value = 0.0
-            for j in range(4):
-                line = 0.0
-                for i in range(4):
-                    line += a[i] * image[top + j - 1, left + i - 1]
-                value += b[j] * line
-            out[y, x] = value
-            solid[y, x] = 1
+            out[y, x] = _interpolated(image, u, v)
+            shown[y, x] = 1
+    solid = np.zeros((height, width), np.uint8)
+    for y in range(1, height - 1):
+        for x in range(1, width - 1):
+            across = shown[y, x - 1] & shown[y, x] & shown[y, x + 1]
+            solid[y, x] = across & shown[y - 1, x] & shown[y + 1, x]
     return out, place, solid
+
+
+@numba.njit(cache=True, fastmath={"reassoc", "contract", "nsz"})
+def _interpolated(image: Any, u: float, v: float) -> Any:
+    """Catmull-Rom interpolation of the sixteen pixels around (u, v)."""
+    left, top = int(u), int(v)
+    s, t = np.float32(u - left), np.float32(v - top)
+    half, one, two = np.float32(0.5), np.float32(1.0), np.float32(2.0)
+    a0 = ((-half * s + one) * s - half) * s
+    a2 = ((-(one + half) * s + two) * s + half) * s
+    a3 = (half * s - half) * s * s
+    a1 = one - a0 - a2 - a3
+    b0 = ((-half * t + one) * t - half) * t
+    b2 = ((-(one + half) * t + two) * t + half) * t
+    b3 = (half * t - half) * t * t
+    b1 = one - b0 - b2 - b3
+    value = np.float32(0.0)
+    for j in range(4):
+        row = image[top + j - 1]
+        line = a0 * row[left - 1] + a1 * row[left] + a2 * row[left + 1] + a3 * row[left + 2]
+        value += (b0 if j == 0 else b1 if j == 1 else b2 if j == 2 else b3) * line
+    return value
 
 
 @numba.njit(cache=True)

@@ -10,7 +10,7 @@ import numpy as np
 
 from capture.arrays import Floats, Ints, Ints32, check_shape
 
-_ITERATIONS = 6
+_ITERATIONS = 5
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -44,8 +44,8 @@ class Lifted:
 
     Attributes:
         motion: (N, 3) mm from the estimate; 0 where no view agrees.
-        information: (N,) mm^-2, the least of the three principal informations along which the
-            views see the point, or the middle one where one view alone sees it.
+        information: (N,) mm^-2, the harmonic mean of the three principal informations, prior
+            included: 3 over the trace of the covariance.
         views: (N,) int64 how many views agree on it.
         residual_px: (N,) median distance between matches and the projected result; NaN for none.
     """
@@ -86,7 +86,7 @@ def triangulate(observations: Observations, count: int, scale_px: float, prior_m
     return Lifted(motion=motion, information=information, views=views, residual_px=residual)
 
 
-@numba.njit(cache=True, parallel=True)
+@numba.njit(cache=True, nogil=True)
 def _triangulate(
     starts: Any, offset: Any, jacobian: Any, information: Any, scale: float, prior: float
 ) -> tuple[Any, Any, Any, Any]:
@@ -95,33 +95,47 @@ def _triangulate(
     strength = np.zeros(count)
     views = np.zeros(count, np.int64)
     residual = np.full(count, np.nan)
-    for n in numba.prange(count):
+    for n in range(count):
         low, high = starts[n], starts[n + 1]
         if low == high:
             continue
         weight = np.ones(high - low)
-        x = np.zeros(3)
+        miss = np.empty(high - low)
         normal = np.empty((3, 3))
         right = np.empty(3)
-        miss = np.empty(high - low)
         for _ in range(_ITERATIONS):
             _accumulate(low, high, offset, jacobian, information, weight, prior, normal, right)
-            x = np.linalg.solve(normal, right)
+            x, y, z, spread = _solve(normal, right)
             for k in range(low, high):
-                u = jacobian[k, 0, 0] * x[0] + jacobian[k, 0, 1] * x[1] + jacobian[k, 0, 2] * x[2]
-                v = jacobian[k, 1, 0] * x[0] + jacobian[k, 1, 1] * x[1] + jacobian[k, 1, 2] * x[2]
-                miss[k - low] = np.hypot(u - offset[k, 0], v - offset[k, 1])
+                one, two = jacobian[k, 0], jacobian[k, 1]
+                u = one[0] * x + one[1] * y + one[2] * z - offset[k, 0]
+                v = two[0] * x + two[1] * y + two[2] * z - offset[k, 1]
+                miss[k - low] = np.sqrt(u * u + v * v)
                 weight[k - low] = 1.0 / (1.0 + (miss[k - low] / scale) ** 2) ** 2
         agree = miss[weight > 0.25]
         views[n] = len(agree)
         if len(agree) == 0:
             continue
-        motion[n] = x
+        motion[n, 0], motion[n, 1], motion[n, 2] = x, y, z
         residual[n] = np.median(agree)
-        _accumulate(low, high, offset, jacobian, information, weight, 0.0, normal, right)
-        principal = np.linalg.eigvalsh(normal)
-        strength[n] = principal[0] if len(agree) > 1 else principal[1]
+        strength[n] = 3.0 / spread
     return motion, strength, views, residual
+
+
+@numba.njit(cache=True)
+def _solve(a: Any, b: Any) -> tuple[float, float, float, float]:
+    """Solution of a symmetric 3 x 3 system, and the trace of the inverse."""
+    c00 = a[1, 1] * a[2, 2] - a[1, 2] * a[1, 2]
+    c01 = a[0, 2] * a[1, 2] - a[0, 1] * a[2, 2]
+    c02 = a[0, 1] * a[1, 2] - a[0, 2] * a[1, 1]
+    c11 = a[0, 0] * a[2, 2] - a[0, 2] * a[0, 2]
+    c12 = a[0, 1] * a[0, 2] - a[0, 0] * a[1, 2]
+    c22 = a[0, 0] * a[1, 1] - a[0, 1] * a[0, 1]
+    whole = a[0, 0] * c00 + a[0, 1] * c01 + a[0, 2] * c02
+    x = (c00 * b[0] + c01 * b[1] + c02 * b[2]) / whole
+    y = (c01 * b[0] + c11 * b[1] + c12 * b[2]) / whole
+    z = (c02 * b[0] + c12 * b[1] + c22 * b[2]) / whole
+    return x, y, z, (c00 + c11 + c22) / whole
 
 
 @numba.njit(cache=True)

@@ -149,13 +149,13 @@ def _joined(a: int, b: int, triangles: Any, starts: Any, others: Any) -> bool:
     return low < starts[one + 1] and others[low] == two  # type: ignore[no-any-return]
 
 
-@numba.njit(cache=True, parallel=True)
+@numba.njit(cache=True, nogil=True)
 def _joints(ids: Any, triangles: Any, starts: Any, others: Any) -> tuple[Masks, Masks]:
     """Whether each pixel is joined to its right and to its lower neighbour."""
     height, width = ids.shape
     right = np.zeros((height, width), np.uint8)
     down = np.zeros((height, width), np.uint8)
-    for y in numba.prange(height):
+    for y in range(height):
         for x in range(width):
             if ids[y, x] < 0:
                 continue
@@ -166,13 +166,13 @@ def _joints(ids: Any, triangles: Any, starts: Any, others: Any) -> tuple[Masks, 
     return right, down
 
 
-@numba.njit(cache=True, parallel=True)
+@numba.njit(cache=True, nogil=True)
 def _flood(centres: Any, right: Any, down: Any, half: int) -> Masks:
     """Pixels of each window that are joined to its centre inside the window."""
     height, width = right.shape
     side = 2 * half + 1
     out = np.zeros((len(centres), side, side), np.uint8)
-    for n in numba.prange(len(centres)):
+    for n in range(len(centres)):
         left, top = centres[n, 0] - half, centres[n, 1] - half
         stack = np.empty((side * side, 2), np.int32)
         stack[0, 0], stack[0, 1] = half, half
@@ -198,13 +198,13 @@ def _flood(centres: Any, right: Any, down: Any, half: int) -> Masks:
     return out
 
 
-@numba.njit(cache=True, parallel=True)
+@numba.njit(cache=True, nogil=True)
 def _drop_strangers(
     windows: Any, centres: Any, ids: Any, triangles: Any, own: Any, starts: Any, others: Any
 ) -> None:
     """Empty the windows whose centre pixel shows another piece of surface than the sample's."""
     height, width = ids.shape
-    for n in numba.prange(len(centres)):
+    for n in range(len(centres)):
         x, y = centres[n]
         known = 0 <= x < width and 0 <= y < height and ids[y, x] >= 0
         if not known or not _joined(ids[y, x], own[n], triangles, starts, others):

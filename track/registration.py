@@ -8,48 +8,31 @@ are not handed to the next: the last place only says where to look.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import os
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 from scipy import sparse
 
-from capture.arrays import Bools, Floats, Floats32, Ints32
+from capture.arrays import Floats, Floats32, Ints32
 from capture.camera import Camera
 from capture.errors import SettingsError, SolveError
 from track.flow import FlowMatches, refine_flow, search_flow
 from track.guide import GuidedView, guided_view
 from track.laplacian import Constraints, LaplacianDeformer, Stiffness
 from track.lift import Lifted, Observations, triangulate
+from track.observe import believable, merged, observe
 from track.pyramid import camera_at_level, image_pyramid
 from track.raster import Rasterizer
 from track.reference import ReferenceLevel, facing_normals, reference_level, visible_samples
+from track.schedule import Step
 from track.surface_samples import SurfaceSamples, sample_surface, vertex_rings
 
-_WINDOW_GAIN = 50.0  # independent pixels of a window, about: turns the windows' shape into px^-2
 _PRIOR_MM = 1.0
+_SINGLE_VIEW = 0.02  # weight of a sample that one view alone sees: its depth is the estimate's
 _RINGS = 3  # edges within which two triangles count as one piece of surface
-
-
-@dataclass(frozen=True, kw_only=True)
-class Step:
-    """One round of guide, match, lift and solve.
-
-    Attributes:
-        level: pyramid level, 0 the finest.
-        search_px: half side of the whole-pixel search, px of the level; 0 refines only.
-        iterations: Gauss-Newton steps of the sub-pixel refinement.
-        limit_px: longest displacement believed, px of the level.
-        scale_px: robust scale of the triangulation, px of the level.
-        bending_mm: stiffness of the solve.
-    """
-
-    level: int
-    search_px: int
-    iterations: int
-    limit_px: float
-    scale_px: float
-    bending_mm: float
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -111,13 +94,13 @@ class Registrar:
         self._raster = Rasterizer(triangles, len(neutral))
         self._rings = vertex_rings(triangles, len(neutral), _RINGS)
         self._levels = max(step.level for step in options.steps) + 1
-        self._views = {
-            name: self._reference(cameras[name], image) for name, image in images.items()
-        }
+        self._pool = ThreadPoolExecutor(os.cpu_count() or 1)  # the kernels let go of the GIL
+        self._views = {name: self._reference(cameras[name], images[name]) for name in images}
         seen = np.zeros(len(self._samples), np.int64)
         for levels in self._views.values():
             seen[levels[0].samples] += 1
         self._seen = seen
+        self._mm_per_px = _pixel_size(cameras, neutral)
         self._deformers = {
             mm: LaplacianDeformer(neutral, triangles, Stiffness(bending_mm=mm))
             for mm in sorted({step.bending_mm for step in options.steps})
@@ -153,7 +136,7 @@ class Registrar:
         vertices = start
         occluders: dict[str, tuple[Floats32, float]] = {}
         for index, step in enumerate(self._options.steps):
-            if index == 1 or index == len(self._options.steps) - 1:
+            if index == 1:  # the first round has brought the mesh within the tolerance
                 occluders = {name: self._depth(name, vertices) for name in usable}
             scaled = {
                 name: (depth, scale / 2**step.level) for name, (depth, scale) in occluders.items()
@@ -164,22 +147,25 @@ class Registrar:
         return self._result(vertices, lifted, weights, score)
 
     def _reference(self, camera: Camera, image: Floats32) -> list[ReferenceLevel]:
+        points = self._samples.points(self._neutral)
+        lenses = [camera_at_level(camera, level) for level in range(self._levels)]
+        drawn = [self._raster.render(lens, self._neutral) for lens in lenses]
         normals = facing_normals(self._neutral, self._triangles)
-        out: list[ReferenceLevel] = []
-        chosen = np.empty(0, np.int32)
-        for level, picture in enumerate(image_pyramid(image, self._levels)):
-            small = camera_at_level(camera, level)
-            buffers = self._raster.render(small, self._neutral)
-            if level == 0:
-                chosen = visible_samples(
-                    self._samples, self._neutral, normals, camera, buffers,
-                    self._options.min_cosine,
-                )  # fmt: skip
-            pixels = small.project(self._samples.points(self._neutral)[chosen])
-            surface = (self._triangles, self._samples.triangle[chosen], self._rings)
-            half = self._options.half_window if level == 0 else self._options.half_window_coarse
-            out.append(reference_level(small, picture, buffers, pixels, chosen, surface, half))
-        return out
+        chosen = visible_samples(
+            self._samples, self._neutral, normals, camera, drawn[0], self._options.min_cosine
+        )
+        surface = (self._triangles, self._samples.triangle[chosen], self._rings)
+        fine, coarse = self._options.half_window, self._options.half_window_coarse
+
+        def build(level: int, picture: Floats32) -> ReferenceLevel:
+            pixels = lenses[level].project(points[chosen])
+            half = fine if level == 0 else coarse
+            return reference_level(
+                lenses[level], picture, drawn[level], pixels, chosen, surface, half
+            )
+
+        pyramid = image_pyramid(image, self._levels)
+        return list(self._pool.map(build, range(self._levels), pyramid))
 
     def _depth(self, name: str, vertices: Floats) -> tuple[Floats32, float]:
         """A coarse depth map of the mesh, and how many finest pixels one of its pixels spans."""
@@ -195,41 +181,32 @@ class Registrar:
         occluders: Mapping[str, tuple[Floats32, float]],
     ) -> tuple[Lifted, float]:
         points = self._samples.points(vertices)
-        parts: list[Observations] = []
-        scores: list[Floats] = []
-        for name, image in images.items():
+
+        def measure(name: str) -> tuple[Observations, Floats]:
             level = self._views[name][step.level]
-            view = guided_view(level, self._triangles, vertices, image, occluders.get(name))
+            view = guided_view(level, self._triangles, vertices, images[name], occluders.get(name))
             matches = self._match(step, level, view)
-            found, kept = _observations(level, view, matches, points, self._limits(step))
-            parts.append(found)
-            scores.append(matches.correlation[kept])
-        every = np.concatenate(scores)
-        merged = Observations(
-            sample=np.concatenate([part.sample for part in parts]),
-            offset=np.concatenate([part.offset for part in parts]),
-            jacobian=np.concatenate([part.jacobian for part in parts]),
-            information=np.concatenate([part.information for part in parts]),
-        )
-        lifted = triangulate(merged, len(self._samples), step.scale_px, _PRIOR_MM)
+            believed = believable(matches, self._options.min_correlation, step.limit_px)
+            seen = observe(level, view, matches, points, believed)
+            return seen, matches.correlation[believed]
+
+        measured = list(self._pool.map(measure, images))  # in the order of the views
+        every = np.concatenate([scores for _, scores in measured])
+        parts = [seen for seen, _ in measured]
+        lifted = triangulate(merged(parts), len(self._samples), step.scale_px, _PRIOR_MM)
         return lifted, float(every.mean()) if len(every) else 0.0
 
-    def _limits(self, step: Step) -> tuple[float, float]:
-        return self._options.min_correlation, step.limit_px
-
     def _match(self, step: Step, level: ReferenceLevel, view: GuidedView) -> FlowMatches:
-        start = np.zeros((len(level.samples), 2))
-        if step.search_px > 0:
-            chosen = level.samples % self._options.search_stride == 0
-            found = search_flow(level, view, chosen, step.search_px)
-            start = found.displacement
-        return refine_flow(level, view, start, step.iterations)
+        stride = self._options.search_stride if step.level == self._levels - 1 else 1
+        chosen = level.samples % stride == 0
+        found = search_flow(level, view, chosen, step.search_px)
+        return refine_flow(level, view, found.displacement, step.iterations)
 
     def _solve(self, step: Step, vertices: Floats, lifted: Lifted) -> tuple[Floats, Floats]:
         weights = lifted.information / (lifted.information + _typical(lifted.information))
-        weights = np.where(lifted.views >= 2, weights, 0.05 * weights)
-        weights = np.where(lifted.views >= 1, weights, 0.0)
-        weights *= _agreement(self._neighbours, lifted.motion, weights)
+        weights = np.where(lifted.views == 1, _SINGLE_VIEW, weights)
+        floor_mm = step.scale_px * 2**step.level * self._mm_per_px
+        weights *= _agreement(self._neighbours, lifted.motion, weights, floor_mm)
         used = np.flatnonzero(weights > 1e-4)
         if len(used) < 12:
             return vertices, weights
@@ -300,60 +277,6 @@ class RegistrarOptions:
             raise SettingsError("steps: expected at least one")
 
 
-def _observations(
-    level: ReferenceLevel,
-    view: GuidedView,
-    matches: FlowMatches,
-    points: Floats,
-    limits: tuple[float, float],
-) -> tuple[Observations, Bools]:
-    """A view's believable matches as observations, and which they are."""
-    least, longest = limits
-    kept = (matches.correlation > least) & (
-        np.abs(np.nan_to_num(matches.displacement, nan=1e9)).max(axis=1) < longest
-    )
-    slope = _slopes(view.place, level.centres)
-    kept &= np.isfinite(slope).all(axis=(1, 2))
-    slope = slope[kept]
-    offset = np.einsum("lxy,ly->lx", slope, matches.displacement[kept])
-    xx, xy, yy = matches.information[kept].T
-    shape = np.stack([np.stack([xx, xy], -1), np.stack([xy, yy], -1)], -2)
-    back = np.linalg.inv(slope)
-    shape = back.transpose(0, 2, 1) @ shape @ back
-    noise = 2.0 * (1.0 - matches.correlation[kept]) + 0.02
-    shape *= (_WINDOW_GAIN / noise)[:, None, None]
-    which = level.samples[kept]
-    found = Observations(
-        sample=which,
-        offset=offset,
-        jacobian=level.camera.project_jacobian(points[which]),
-        information=np.stack([shape[:, 0, 0], shape[:, 0, 1], shape[:, 1, 1]], axis=1),
-    )
-    return found, kept
-
-
-def _slopes(place: Floats32, centres: Ints32) -> Floats:
-    """Derivative (M, 2, 2) of the guide at the centres: frame px per reference px; NaN unknown."""
-    height, width = place.shape[:2]
-    x = np.clip(centres[:, 0], 1, width - 2)
-    y = np.clip(centres[:, 1], 1, height - 2)
-    out = np.empty((len(centres), 2, 2))
-    here = place[y, x].astype(np.float64)
-    for axis, (v, u) in enumerate(((0, 1), (1, 0))):
-        after = place[y + v, x + u].astype(np.float64) - here
-        before = here - place[y - v, x - u].astype(np.float64)
-        both = np.stack([after, before])
-        known = np.isfinite(both).all(axis=2)
-        total = np.where(known[..., None], both, 0.0).sum(axis=0)
-        count = known.sum(axis=0)
-        mean = total / np.maximum(count, 1)[:, None]
-        out[:, :, axis] = np.where(count[:, None] > 0, mean, np.nan)
-    area: Floats = out[:, 0, 0] * out[:, 1, 1] - out[:, 0, 1] * out[:, 1, 0]
-    folded: Bools = np.less(np.abs(np.nan_to_num(area)), 0.05)  # or turned away
-    out[folded] = np.nan
-    return out
-
-
 def _neighbour_matrix(
     samples: SurfaceSamples, triangles: Ints32, vertex_count: int
 ) -> sparse.csr_matrix:
@@ -368,52 +291,35 @@ def _neighbour_matrix(
     return sparse.csr_matrix(near)
 
 
-def _agreement(neighbours: sparse.csr_matrix, motion: Floats, weights: Floats) -> Floats:
-    """Weights (N,) 0..1 that fall where a sample moves otherwise than its neighbours."""
-    trust = weights.copy()
+def _agreement(
+    neighbours: sparse.csr_matrix, motion: Floats, weights: Floats, floor_mm: float
+) -> Floats:
+    """Weights (N,) 0..1 that fall where a sample leaves the spread of its neighbours' motions.
+
+    The spread is local: where the surface stretches or folds, neighbours move differently in
+    earnest, and only a sample outside their range is an outlier.
+    """
     factor: Floats = np.ones(len(weights))
     for _ in range(2):
-        total = neighbours @ trust
-        mean = (neighbours @ (trust[:, None] * motion)) / np.maximum(total, 1e-9)[:, None]
-        away = np.linalg.norm(motion - mean, axis=1)
-        scale = 3.0 * 1.4826 * _typical(away[weights > 0]) + 0.05
-        factor = 1.0 / (1.0 + (away / scale) ** 2) ** 2
-        factor[total < 1e-6] = 0.25
         trust = weights * factor
+        total = neighbours @ trust
+        share = np.maximum(total, 1e-12)
+        mean = (neighbours @ (trust[:, None] * motion)) / share[:, None]
+        square = (neighbours @ (trust * (motion**2).sum(axis=1))) / share
+        spread = np.sqrt(np.maximum(square - (mean**2).sum(axis=1), 0.0))
+        away = np.linalg.norm(motion - mean, axis=1)
+        factor = 1.0 / (1.0 + (away / (2.0 * spread + floor_mm)) ** 2) ** 2
+        factor[total < 1e-6] = 0.25  # nobody beside it to ask
     return factor
+
+
+def _pixel_size(cameras: Mapping[str, Camera], vertices: Floats) -> float:
+    """How many mm a pixel spans at the mesh, in the middle of the cameras."""
+    centre = vertices.mean(axis=0)[None]
+    sizes = [abs(float(camera.depths(centre)[0])) / camera.fx for camera in cameras.values()]
+    return float(np.median(sizes))
 
 
 def _typical(values: Floats) -> float:
     positive = values[values > 0]
     return float(np.median(positive)) if len(positive) else 1.0
-
-
-def schedule(
-    levels: int, search_px: float, passes: int, bending_mm: Sequence[float]
-) -> tuple[Step, ...]:
-    """The steps of a frame: search at the coarsest level, refine at the others.
-
-    Args:
-        levels: how many pyramid levels.
-        search_px: half side of the search, px of the finest level.
-        passes: rounds at the finest level.
-        bending_mm: stiffness at the coarsest level and in the last round; between, geometric.
-    """
-    coarse, fine = bending_mm
-    order = [*range(levels - 1, 0, -1), *[0] * passes]
-    share = np.linspace(0.0, 1.0, len(order)) if len(order) > 1 else np.ones(1)
-    out = []
-    for index, level in enumerate(order):
-        radius = max(1, round(search_px / 2**level)) if index == 0 else 0
-        last = index == len(order) - 1
-        out.append(
-            Step(
-                level=level,
-                search_px=radius,
-                iterations=3 if not last else 2,
-                limit_px=radius + 1.5 if index == 0 else 3.0 if not last else 1.5,
-                scale_px=1.5 if index == 0 else 1.0 if not last else 0.7,
-                bending_mm=float(coarse * (fine / coarse) ** share[index]),
-            )
-        )
-    return tuple(out)

@@ -32,7 +32,8 @@ from recon.mesh import Mesh
 from track.head_motion import damped_motion, head_motion
 from track.performance import Performance, read_performance, write_performance
 from track.pyramid import level_count
-from track.registration import FrameResult, Registrar, RegistrarOptions, schedule
+from track.registration import FrameResult, Registrar, RegistrarOptions
+from track.schedule import schedule
 
 _FIGURES = ("samples", "correlation", "residual_px", "views", "seconds")
 _MIN_VIEWS = 2

@@ -1,0 +1,116 @@
+"""Flow in the reference's pixels turned into observations of samples in the frame's pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numba
+import numpy as np
+
+from capture.arrays import Bools, Floats
+from track.flow import FlowMatches
+from track.guide import GuidedView
+from track.lift import Observations
+from track.reference import ReferenceLevel
+
+_WINDOW_GAIN = 50.0  # independent pixels of a window, about: turns the windows' shape into px^-2
+_NOISE = 0.02  # of two perfect windows, in unit variances: no match is surer than this
+_FOLDED = 0.05  # area that a reference pixel keeps in the frame below which it is turned away
+
+
+def believable(matches: FlowMatches, least: float, longest_px: float) -> Bools:
+    """Which matches (M,) correlate by more than `least` and are shorter than `longest_px`."""
+    size = np.abs(np.nan_to_num(matches.displacement, nan=np.inf)).max(axis=1)
+    believed: Bools = (matches.correlation > least) & (size < longest_px)
+    return believed
+
+
+def observe(
+    level: ReferenceLevel,
+    view: GuidedView,
+    matches: FlowMatches,
+    points: Floats,
+    believed: Bools,
+) -> Observations:
+    """Carry a view's matches from the reference into the frame.
+
+    A displacement e in the reference's pixels is the offset A e in the frame's, A being the
+    derivative of the guide; its information I becomes A^-T I A^-1, over the noise that the
+    correlation shows.
+
+    Args:
+        level: the view's reference.
+        view: the guide that the matches were measured with.
+        matches: of the level's M samples.
+        points: (N, 3) all samples on the mesh's estimate, world mm.
+        believed: (M,) the matches to use.
+    """
+    offset, information, good = _carry(
+        view.place, level.centres, matches.displacement, matches.correlation,
+        matches.information, believed,
+    )  # fmt: skip
+    which = level.samples[good]
+    return Observations(
+        sample=which,
+        offset=offset[good],
+        jacobian=level.camera.project_jacobian(points[which]),
+        information=information[good],
+    )
+
+
+def merged(parts: Sequence[Observations]) -> Observations:
+    """The observations of all views in one."""
+    return Observations(
+        sample=np.concatenate([part.sample for part in parts]),
+        offset=np.concatenate([part.offset for part in parts]),
+        jacobian=np.concatenate([part.jacobian for part in parts]),
+        information=np.concatenate([part.information for part in parts]),
+    )
+
+
+@numba.njit(cache=True, nogil=True)
+def _carry(
+    place: Any, centres: Any, displacement: Any, correlation: Any, information: Any, believed: Any
+) -> tuple[Any, Any, Any]:
+    count = len(centres)
+    offset = np.zeros((count, 2))
+    out = np.zeros((count, 3))
+    good = np.zeros(count, np.bool_)
+    for n in range(count):
+        if not believed[n]:
+            continue
+        x, y = centres[n]
+        ax, ay = _slope(place, x, y, 1, 0)
+        bx, by = _slope(place, x, y, 0, 1)
+        area = ax * by - bx * ay
+        if not abs(area) > _FOLDED:
+            continue
+        e, f = displacement[n]
+        offset[n, 0], offset[n, 1] = ax * e + bx * f, ay * e + by * f
+        p, q, r, s = by / area, -bx / area, -ay / area, ax / area  # the inverse of A
+        xx, xy, yy = information[n]
+        gain = _WINDOW_GAIN / (2.0 * (1.0 - correlation[n]) + _NOISE)
+        out[n, 0] = gain * (p * p * xx + 2.0 * p * r * xy + r * r * yy)
+        out[n, 1] = gain * (p * q * xx + (p * s + q * r) * xy + r * s * yy)
+        out[n, 2] = gain * (q * q * xx + 2.0 * q * s * xy + s * s * yy)
+        good[n] = True
+    return offset, out, good
+
+
+@numba.njit(cache=True)
+def _slope(place: Any, x: int, y: int, dx: int, dy: int) -> tuple[float, float]:
+    """Derivative of the guide at a pixel along one axis, from the neighbours that it has."""
+    height, width = place.shape[0], place.shape[1]
+    high_x, high_y = min(x + dx, width - 1), min(y + dy, height - 1)
+    low_x, low_y = max(x - dx, 0), max(y - dy, 0)
+    if np.isnan(place[high_y, high_x, 0]):
+        high_x, high_y = x, y
+    if np.isnan(place[low_y, low_x, 0]):
+        low_x, low_y = x, y
+    span = (high_x - low_x) + (high_y - low_y)
+    if span == 0:
+        return np.nan, np.nan
+    across = float(place[high_y, high_x, 0]) - float(place[low_y, low_x, 0])
+    along = float(place[high_y, high_x, 1]) - float(place[low_y, low_x, 1])
+    return across / span, along / span

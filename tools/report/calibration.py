@@ -14,7 +14,7 @@ from tools.report.svg import PALETTE, drawing, element, escape, number
 
 _GOOD_PX, _FAIR_PX = 0.25, 0.6
 _GOOD_RATIO, _FAIR_RATIO = 1.15, 1.5
-_ARROW_SCALE = 150.0
+_ARROW_PX = 40.0  # length of a drawn residual at the 95th percentile, px of the image
 _UNLISTED = ("devices", "poses", "residual_vectors", "warnings")
 
 
@@ -30,9 +30,10 @@ def calibration_section(inputs: ReportInputs) -> list[Section]:
     coverage = [_coverage(entry) for entry in devices if "coverage" in entry]
     if coverage:
         parts.append("<h3>Where the board has been in each image</h3>" + gallery(coverage, "small"))
-    arrows = _arrows(report, inputs)
+    scale = _arrow_scale(report)
+    arrows = _arrows(report, inputs, scale)
     if arrows:
-        words = f"Residual vectors, {_ARROW_SCALE:.0f} times enlarged"
+        words = f"Residual vectors, {scale:g} times enlarged"
         parts.append(f"<h3>{escape(words)}</h3>" + gallery(arrows, "small"))
     poses = [entry for entry in report.get("poses", []) if isinstance(entry, Mapping)]
     if poses:
@@ -84,7 +85,8 @@ def _warnings(report: Mapping[str, Any]) -> str:
 
 def _top_numbers(report: Mapping[str, Any]) -> dict[str, object]:
     flat = flattened({key: value for key, value in report.items() if key not in _UNLISTED})
-    return {name.replace("_", " ").replace(".", ", "): value for name, value in flat.items()}
+    plain = {name: value for name, value in flat.items() if isinstance(value, (int, float))}
+    return {name.replace("_", " ").replace(".", ", "): value for name, value in plain.items()}
 
 
 def _residual_bars(devices: Sequence[Mapping[str, Any]]) -> str:
@@ -126,7 +128,21 @@ def _pose_chart(poses: Sequence[Mapping[str, Any]]) -> str:
     return figure(line_chart([line], labels, height=150.0), "A peak is a board that moved.")
 
 
-def _arrows(report: Mapping[str, Any], inputs: ReportInputs) -> list[str]:
+def _arrow_scale(report: Mapping[str, Any]) -> float:
+    """A round enlargement at which a long residual is easy to see and no arrow crosses another."""
+    vectors = report.get("residual_vectors")
+    if not isinstance(vectors, Mapping):
+        return 1.0
+    rows = [row for device in vectors.values() for row in device]
+    sizes = [float(np.hypot(row[2], row[3])) for row in rows if len(row) == 4]
+    long_px = float(np.percentile(sizes, 95)) if sizes else 0.0
+    if long_px <= 0:
+        return 1.0
+    power = 10.0 ** np.floor(np.log10(_ARROW_PX / long_px))
+    return float(max(m * power for m in (1, 2, 5) if m * power <= _ARROW_PX / long_px))
+
+
+def _arrows(report: Mapping[str, Any], inputs: ReportInputs, scale: float) -> list[str]:
     array, vectors = inputs.array, report.get("residual_vectors")
     if array is None or not isinstance(vectors, Mapping):
         return []
@@ -136,7 +152,7 @@ def _arrows(report: Mapping[str, Any], inputs: ReportInputs) -> list[str]:
         if values.ndim != 2 or values.shape[1] != 4:
             continue
         size = (camera.width, camera.height)
-        chart = arrow_chart(size, values[:, :2], values[:, 2:], _ARROW_SCALE, camera.name)
+        chart = arrow_chart(size, values[:, :2], values[:, 2:], scale, camera.name)
         out.append(figure(chart, f"{camera.name}, {len(values)} corners"))
     return out
 

@@ -13,7 +13,7 @@ from capture.ledger import Verdict as Fate
 from capture.take import Take
 from tools.report.charts import Labels, bar_chart, matrix_chart
 from tools.report.inputs import ReportInputs, TakeInputs
-from tools.report.page import Section, Verdict, facts, figure, folded, table
+from tools.report.page import Section, Verdict, figure, folded, table
 from tools.report.svg import escape
 
 _FATES = {
@@ -30,7 +30,7 @@ _STEP = 4  # every fourth pixel of every fourth row is enough for a mean
 
 def capture_section(inputs: ReportInputs) -> list[Section]:
     """Each take's ledger as a matrix of triggers and devices, its clocks, its image levels."""
-    parts, verdicts = [], []
+    parts, verdicts, rows = [], [], []
     for item in inputs.takes:
         path = item.folder / "ledger.csv"
         if not path.is_file():
@@ -38,17 +38,22 @@ def capture_section(inputs: ReportInputs) -> list[Section]:
         ledger = read_ledger(path)
         verdict = take_verdict(item.take, ledger)
         verdicts.append(verdict)
-        parts.append(f"<h3>{escape(item.take.name)}</h3>")
-        parts.append(facts(_facts(item, ledger)))
-        chart = _matrix(item.take.name, ledger)
+        rows.append({"take": item.take.name} | _facts(item, ledger))
+        chart = figure(
+            _matrix(item.take.name, ledger),
+            "Every trigger of every device has exactly one verdict.",
+        )
+        devices = _devices(item.take)
         if verdict.level == "good" and len(inputs.takes) > 1:
-            parts.append(folded("every trigger of every device", chart))
+            parts.append(folded(f"{item.take.name}: ledger, levels, clocks", chart + devices))
         else:
-            parts.append(figure(chart, "Every trigger of every device has exactly one verdict."))
-        parts.append(folded("levels and clocks of the devices", _devices(item.take)))
-    if not parts:
+            inner = folded("levels and clocks of the devices", devices)
+            parts.append(f"<h3>{escape(item.take.name)}</h3>{chart}{inner}")
+    if not rows:
         return []
-    body = "".join(parts)
+    head = list(dict.fromkeys(key for row in rows for key in row))
+    cells = [[row.get(key, "") for key in head] for row in rows]
+    body = table(head, cells) + "".join(parts)
     return [Section(anchor="capture", title="Capture", body=body, verdicts=tuple(verdicts))]
 
 
@@ -102,7 +107,7 @@ def _facts(item: TakeInputs, ledger: Ledger) -> dict[str, object]:
         values["exposure, us"] = exposure
     spread = _part(manifest.remarks, "judgement").get("spread_ns")
     if isinstance(spread, int) and spread >= 0:
-        values["largest spread within a frame set, us"] = spread / 1000.0
+        values["spread, us"] = spread / 1000.0
     for fate, count in ledger.counts().items():
         if count:
             values[f"{fate.value.replace('_', ' ')}"] = count

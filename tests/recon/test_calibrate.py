@@ -89,6 +89,20 @@ def test_small_images_converge_for_every_seed(seed: int) -> None:
     assert solution.converged
 
 
+@pytest.mark.slow
+def test_twenty_arrays_with_bent_boards_and_outliers_all_converge() -> None:
+    for seed in range(20):
+        scene = BoardScene(
+            size_px=640, focal_px=(1440.0, 1000.0, 2600.0, 700.0)[seed % 4],
+            radius_mm=(620.0, 620.0, 900.0, 400.0)[seed % 4], devices=(4, 6, 5, 8)[seed % 4],
+            poses=12, bow_mm=0.4, outliers=0.03, hidden=0.3, noise_px=0.15, seed=10 + seed,
+        )  # fmt: skip
+        truth = make_state(scene)
+        settings = CalibrateSettings(least_views=2)
+        found = solve_array(observe(scene, truth), CORNERS, settings).state.cameras
+        assert rms_um(truth.cameras, found) < 20.0, f"seed {seed}"
+
+
 def test_the_first_guess_alone_comes_close() -> None:
     truth = make_state(SMALL)
     observations = observe(SMALL, truth)

@@ -14,6 +14,7 @@ import os
 import struct
 import zlib
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
@@ -23,7 +24,7 @@ import numpy as np
 
 from capture.arrays import Image
 from capture.crc import Crc32Joiner
-from capture.errors import TakeError
+from capture.errors import TakeError, WorkError
 
 MAGIC = b"\x89MCAP0\r\n"
 HEADER_BYTES = 64
@@ -188,7 +189,8 @@ class FrameWriter:
             "byteorder": "little",
         }
         self._description = _schema() + _channel(device, metadata)
-        self._write(MAGIC + _record(_HEADER, _text("") + _text("likeness")) + self._description)
+        with self._discarded_on_failure():
+            self._write(MAGIC + _record(_HEADER, _text("") + _text("likeness")) + self._description)
 
     def __enter__(self) -> FrameWriter:
         return self
@@ -202,8 +204,7 @@ class FrameWriter:
         if kind is None:
             self.close()
         else:
-            self._file.close()
-            self._partial.unlink(missing_ok=True)
+            self._discard()
 
     def write(self, header: FrameHeader, pixels: Image) -> None:
         """Append one frame.
@@ -214,6 +215,7 @@ class FrameWriter:
 
         Raises:
             TakeError: when the pixels are of another layout.
+            WorkError: when the disk is full or fails.
         """
         if ImageLayout.of(pixels) != self.layout:
             raise TakeError(f"{self.path}: expected {self.layout}, found {ImageLayout.of(pixels)}")
@@ -240,11 +242,24 @@ class FrameWriter:
         """Write the summary, bring it all to the disk, and give the file its name."""
         if self._file.closed:
             return
-        self._write(_record(_DATA_END, struct.pack("<I", 0)))
-        self._write(self._summary(self._offset))
-        os.fsync(self._file.fileno())
+        with self._discarded_on_failure():
+            self._write(_record(_DATA_END, struct.pack("<I", 0)))
+            self._write(self._summary(self._offset))
+            os.fsync(self._file.fileno())
+            self._file.close()
+            self._partial.replace(self.path)
+
+    @contextmanager
+    def _discarded_on_failure(self) -> Iterator[None]:
+        try:
+            yield
+        except BaseException:
+            self._discard()
+            raise
+
+    def _discard(self) -> None:
         self._file.close()
-        Path(self._partial).replace(self.path)
+        self._partial.unlink(missing_ok=True)
 
     def _summary(self, start: int) -> bytes:
         times = [time for time, _, _ in self._index]
@@ -282,7 +297,10 @@ class FrameWriter:
     def _write(self, *parts: bytes | memoryview) -> None:
         pending = [memoryview(part).cast("B") for part in parts]
         while pending:
-            written = os.writev(self._file.fileno(), pending)
+            try:
+                written = os.writev(self._file.fileno(), pending)
+            except OSError as error:
+                raise WorkError(f"{self.path}: cannot be written: {error.strerror}") from error
             self._offset += written
             while pending and written >= len(pending[0]):
                 written -= len(pending.pop(0))

@@ -32,13 +32,14 @@ class TakeWriter:
         self._layouts = dict(layouts)
         self._places = {name: place for place, name in enumerate(layouts)}
         self._counts = dict.fromkeys(layouts, 0)
-        self._stack = ExitStack()
         frames = self.folder / "frames"
         frames.mkdir(parents=True)
-        self._writers = {
-            name: self._stack.enter_context(FrameWriter(frames / f"{name}.mcap", name, layout))
-            for name, layout in layouts.items()
-        }
+        with ExitStack() as stack:
+            self._writers = {
+                name: stack.enter_context(FrameWriter(frames / f"{name}.mcap", name, layout))
+                for name, layout in layouts.items()
+            }
+            self._stack = stack.pop_all()
 
     def __enter__(self) -> TakeWriter:
         return self

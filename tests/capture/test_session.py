@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+import resource
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from capture.devices.simulated import Fault, FaultKind
-from capture.errors import DeviceError, SettingsError, TakeError
+from capture.errors import DeviceError, SettingsError, TakeError, WorkError
 from capture.recorder import RecordSettings
 from capture.session import Session, Shot, ShotList, record_take
 from capture.take import Take
@@ -157,6 +158,20 @@ def test_a_device_that_fails_leaves_no_take(tmp_path: Path) -> None:
     with pytest.raises(DeviceError, match=r"cam01: no answer for 0\.5 s"):
         record_take(Session.create(tmp_path / "s"), SMILE, array, RecordSettings())
     assert list((tmp_path / "s" / "takes").iterdir()) == []
+
+
+@pytest.mark.parametrize("limit", [600, 1700, 2000, 4000, 5000])
+def test_a_disk_that_takes_no_more_leaves_no_take(tmp_path: Path, limit: int) -> None:
+    session = Session.create(tmp_path / "s")
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))  # bytes a file may have
+        with pytest.raises(WorkError, match=r"cam0\d\.mcap: cannot be written: File too large"):
+            record_take(session, SMILE, array_of(), RecordSettings())
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert list((tmp_path / "s" / "takes").iterdir()) == []
+    assert record_take(session, SMILE, array_of(), RecordSettings()).name == "smile_001"
 
 
 def test_sessions_that_are_none_are_refused(tmp_path: Path) -> None:

@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 from capture.arrays import Bools, Floats32, check_shape
 from capture.errors import SettingsError
 from recon.images import noise_sigma
-from recon.refine import Refined, refine_disparity
+from recon.refine import Refined, grow, refine_disparity
+
+_GROW_NCC = 0.4  # correlation from which a refined pixel lends its disparity to its neighbours
 
 
 class Reason(IntEnum):
@@ -36,23 +38,27 @@ class DisparitySettings:
         seed_px: the seed is matched at the first halving at which the crop is at most this long.
         seed_block: block size of semi-global matching, odd, px.
         radius: of the refinement window at full resolution, px.
-        iterations: refinement steps at full resolution; the levels below take the same number.
+        iterations: refinement steps of the last round at each level; earlier rounds take half.
         smoothness: weight of the smooth surface against a match known to 0.1 px.
         ncc_min: least correlation of the windows.
         contrast_min: least standard deviation in the window, in units of the noise.
         sigma_max_px: largest predicted deviation of the disparity.
+        growth: rounds of refining and growing at the seed's level; one less at finer ones.
+        growth_px: how far the known disparities grow before each round, px.
         left_right_px: largest disagreement with the right view's own disparity.
         fragment_px: patches smaller than this many pixels are dropped.
     """
 
     seed_px: int = 480
     seed_block: int = 5
-    radius: int = 4
-    iterations: int = 8
-    smoothness: float = 0.5
+    radius: int = 3
+    iterations: int = 5
+    smoothness: float = 20.0
     ncc_min: float = 0.5
     contrast_min: float = 1.5
     sigma_max_px: float = 0.25
+    growth: int = 3
+    growth_px: int = 3
     left_right_px: float = 1.0
     fragment_px: int = 200
 
@@ -60,7 +66,7 @@ class DisparitySettings:
         for name, low, high in (
             ("seed_px", 64, 4096), ("seed_block", 1, 21), ("radius", 1, 20), ("iterations", 1, 200),
             ("smoothness", 0.0, 1e3), ("ncc_min", 0.0, 0.99), ("contrast_min", 0.0, 100.0),
-            ("sigma_max_px", 1e-3, 10.0), ("left_right_px", 0.01, 100.0), ("fragment_px", 0, 10**7),
+            ("sigma_max_px", 1e-3, 10.0), ("growth", 1, 20), ("growth_px", 0, 50), ("left_right_px", 0.01, 100.0), ("fragment_px", 0, 10**7),
         ):  # fmt: skip
             value = getattr(self, name)
             if not low <= value <= high:
@@ -169,22 +175,24 @@ def pyramid(left: Floats32, right: Floats32, size_px: int) -> list[tuple[Floats3
 def _climb(
     levels: list[tuple[Floats32, Floats32]], seed: Floats32, settings: DisparitySettings
 ) -> Refined:
-    """Refine the seed at its own level and at every finer one."""
-    refined: Refined | None = None
+    """Refine the seed at its own level and at every finer one, growing it over slanted skin."""
+    start = seed
+    refined = Refined(seed, np.full_like(seed, np.nan), np.full_like(seed, np.nan))
     for index in range(len(levels) - 1, -1, -1):
         view, other = levels[index]
-        start = _spread(seed, 3)
-        if refined is not None:
-            good = np.where(refined.ncc > 0.3, refined.disparity, np.float32(np.nan))
-            start = _double(_spread(good, 2), view.shape)
-        refined = refine_disparity(
-            view, other, start,
-            radius=settings.radius,
-            iterations=settings.iterations,
-            smoothness=settings.smoothness,
-        )  # fmt: skip
-    if refined is None:
-        raise ValueError("a pyramid has at least one level")
+        rounds = settings.growth if index == len(levels) - 1 else settings.growth - 1
+        for turn in range(max(rounds, 1)):
+            refined = refine_disparity(
+                view,
+                other,
+                grow(start, settings.growth_px),
+                radius=settings.radius,
+                iterations=settings.iterations if turn == rounds - 1 else settings.iterations // 2,
+                smoothness=settings.smoothness,
+            )
+            start = np.where(refined.ncc > _GROW_NCC, refined.disparity, np.float32(np.nan))
+        if index > 0:
+            start = _double(start, levels[index - 1][0].shape)
     return refined
 
 
@@ -289,18 +297,4 @@ def _double(disparity: Floats32, shape: tuple[int, ...]) -> Floats32:
     out = np.full(shape, np.float32(np.nan))
     height, width = min(shape[0], size[1]), min(shape[1], size[0])
     out[:height, :width] = fine[:height, :width]
-    return out
-
-
-def _spread(disparity: Floats32, steps: int) -> Floats32:
-    """Continue the known disparities into the unknown by `steps` pixels, by local means."""
-    out = disparity.copy()
-    for _ in range(steps):
-        known = np.isfinite(out)
-        share = cv2.boxFilter(known.astype(np.float32), cv2.CV_32F, (3, 3), normalize=False)
-        total = cv2.boxFilter(
-            np.where(known, out, 0).astype(np.float32), cv2.CV_32F, (3, 3), normalize=False
-        )
-        grown = ~known & (share > 0.5)
-        out[grown] = (total / np.maximum(share, 1))[grown]
     return out

@@ -25,6 +25,9 @@ class FusionSettings:
         agree_px: two pairs agree when their disparities of a point differ by less.
         agreeing: other pairs that must agree with a point, where so many can see it.
         facing_min: least cosine between the normal and the ray to the reference view.
+        lone_facing: as facing_min, for points that no other pair has a surface near.
+        lone_sigma_px: largest predicted deviation of such points.
+        stride: every how many pixels of a diagonal a point is taken; all pixels confirm points.
         voxel_px: points are averaged in voxels of this many pixel footprints.
         passes: rounds of averaging over pairs.
     """
@@ -32,13 +35,17 @@ class FusionSettings:
     agree_px: float = 0.7
     agreeing: int = 2
     facing_min: float = 0.25
+    lone_facing: float = 0.3
+    lone_sigma_px: float = 0.25
+    stride: int = 2
     voxel_px: float = 1.2
     passes: int = 1
 
     def __post_init__(self) -> None:
         for name, low, high in (
             ("agree_px", 0.01, 20.0), ("agreeing", 0, 20), ("facing_min", 0.0, 0.95),
-            ("voxel_px", 0.1, 50.0), ("passes", 1, 5),
+            ("voxel_px", 0.1, 50.0), ("stride", 1, 16), ("lone_facing", 0.0, 1.0), ("lone_sigma_px", 0.0, 10.0),
+            ("passes", 1, 5),
         ):  # fmt: skip
             value = getattr(self, name)
             if not low <= value <= high:
@@ -85,8 +92,12 @@ class Points:
         return len(self.positions)
 
 
-def lift(view: DepthView) -> tuple[Floats32, Floats32, Floats32]:
+def lift(view: DepthView, stride: int = 1) -> tuple[Floats32, Floats32, Floats32]:
     """World points, normals and deviations of the known pixels of a depth view, row by row.
+
+    Args:
+        view: the depth view.
+        stride: only pixels whose row and column add up to a multiple of it.
 
     Returns:
         Points (N, 3), mm; unit normals (N, 3) towards the reference view, NaN where the
@@ -95,6 +106,8 @@ def lift(view: DepthView) -> tuple[Floats32, Floats32, Floats32]:
     geometry = view.geometry
     offset = geometry.left_column - geometry.right_column
     rows, columns = np.nonzero(np.isfinite(view.disparity))
+    taken = (rows + columns) % stride == 0
+    rows, columns = rows[taken], columns[taken]
     disparity = view.disparity[rows, columns].astype(np.float64)
     matches = np.stack([columns.astype(np.float64), rows.astype(np.float64), disparity], axis=1)
     slopes = _plane_slopes(view.disparity, rows, columns)
@@ -189,13 +202,13 @@ def _footprint(view: DepthView) -> float:
     known = view.disparity[np.isfinite(view.disparity)]
     if len(known) == 0:
         return np.inf
-    return float(view.geometry.depth(np.median(known)) / view.geometry.focal_px)
+    return float(view.geometry.depth(np.array(np.median(known))) / view.geometry.focal_px)
 
 
 def _confirmed(
     view: DepthView, packed: _Packed, own: int, settings: FusionSettings
 ) -> tuple[Floats32, Floats32, Floats32, Ints32, Floats32]:
-    points, normals, sigma = lift(view)
+    points, normals, sigma = lift(view, settings.stride)
     towards = view.geometry.left.centre.astype(np.float32) - points
     facing = (normals * towards).sum(axis=1) / np.linalg.norm(towards, axis=1)
     good = facing > settings.facing_min  # NaN fails
@@ -206,10 +219,11 @@ def _confirmed(
             packed.disparity, packed.sigma, packed.layout, packed.frame, packed.centre, packed.lens,
             np.float64(settings.agree_px),
         )  # fmt: skip
-    wanted = 1 + np.minimum(
-        settings.agreeing, np.maximum(seeing, 1 if len(packed.layout) > 1 else 0)
+    wanted = 1 + np.minimum(settings.agreeing, seeing)
+    lone = (support > 1) | (
+        (facing[good] > settings.lone_facing) & (sigma < settings.lone_sigma_px)
     )
-    keep: Bools = (support >= wanted) & (against < support)
+    keep: Bools = (support >= wanted) & (against < support) & lone
     return points[keep], normals[keep], weights[keep], support[keep], spread[keep]
 
 

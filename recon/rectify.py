@@ -89,10 +89,12 @@ class Rectification:
         """Recorded columns and rows (height, width), px, of every rectified pixel of `side`."""
         camera = self.left if side == "left" else self.right
         column = self.left_column if side == "left" else self.right_column
-        u, v = np.meshgrid(np.arange(self.width) - column, np.arange(self.height) - self.row)
-        rays = np.stack([u, v, np.full_like(u, self.focal_px)], axis=-1).reshape(-1, 3)
-        local = rays @ (self.rotation @ camera.camera_from_world.rotation.T)
-        bent = camera.distort(local[:, :2] / np.where(local[:, 2:] > 0, local[:, 2:], np.nan))
+        turn = self.rotation @ camera.camera_from_world.rotation.T
+        u = (np.arange(self.width) - column)[None, :]
+        v = (np.arange(self.height) - self.row)[:, None]
+        x, y, z = (u * turn[0, k] + v * turn[1, k] + self.focal_px * turn[2, k] for k in range(3))
+        z = np.where(z > 0, z, np.nan)
+        bent = camera.distort(np.stack([x / z, y / z], axis=-1).reshape(-1, 2))
         pixels = bent * [camera.fx, camera.fy] + [camera.cx, camera.cy]
         planes = (
             np.nan_to_num(pixels, nan=-1e4).astype(np.float32).reshape(self.height, self.width, 2)

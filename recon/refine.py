@@ -20,7 +20,10 @@ from scipy import ndimage
 
 from capture.arrays import Bools, Floats32
 
-_TINY = 1e-12
+# A cubic through neighbours 1 and 2 steps away answers -5/3 to its shortest wave: undamped, that wave
+# would grow. Neighbours 2 and 4 away calm waves as long as the window, which matching cannot see.
+_DAMPING = np.float32(0.8)
+_WAYS = ((0, 1), (1, 0), (0, 2), (2, 0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,24 +147,41 @@ def match_step(
     """
     known = np.isfinite(left) & np.isfinite(slope) & np.isfinite(warped)
     level = np.float32(left[known].mean()) if known.any() else np.float32(0.0)
-    a = np.where(known, left - level, np.float32(0.0))
-    b = np.where(known, warped - level, np.float32(0.0))
-    g = np.where(known, slope, np.float32(0.0))
-    products = (known.astype(np.float32), a, b, g, a * a, b * b, g * g, a * b, a * g, b * g)
-    sums = [_window_mean(np.ascontiguousarray(p), radius) for p in products]
-    step, ncc, sigma = _solve_windows(np.stack(sums), known, (1.5 * (radius + 1)) ** 2)
+    means = _products(left, slope, warped, known, level)
+    for plane in means:
+        _window_mean(plane, radius)
+    step, ncc, sigma = _solve_windows(means, known, (1.5 * (radius + 1)) ** 2)
     return step, ncc, sigma
 
 
-def _window_mean(plane: Floats32, radius: int) -> Floats32:
-    """Weighted mean of (H, W) over a pyramid-shaped window; the plane counts as 0 outside.
+@numba.njit(cache=True, nogil=True)
+def _products(
+    left: Floats32, slope: Floats32, warped: Floats32, known: Bools, level: np.float32
+) -> Floats32:  # pragma: no cover - compiled
+    """Planes (10, H, W): mask, a, b, g and their six products, 0 where not known."""
+    height, width = known.shape
+    out = np.zeros((10, height, width), np.float32)
+    for i in range(height):
+        for j in range(width):
+            if not known[i, j]:
+                continue
+            a, b, g = left[i, j] - level, warped[i, j] - level, slope[i, j]
+            out[0, i, j] = np.float32(1.0)
+            out[1, i, j], out[2, i, j], out[3, i, j] = a, b, g
+            out[4, i, j], out[5, i, j], out[6, i, j] = a * a, b * b, g * g
+            out[7, i, j], out[8, i, j], out[9, i, j] = a * b, a * g, b * g
+    return out
+
+
+def _window_mean(plane: Floats32, radius: int) -> None:
+    """Weighted mean of (H, W), in place, over a pyramid-shaped window; 0 counts outside.
 
     The window is a box passed twice: its spectrum is never negative. With a plain box the iteration
     would amplify disparity waves a little shorter than the window, and diverge.
     """
     for length in (radius // 2 * 2 + 1, (radius + 1) // 2 * 2 + 1):
-        plane = cv2.boxFilter(plane, cv2.CV_32F, (length, length), borderType=cv2.BORDER_CONSTANT)
-    return plane
+        size = (length, length)
+        cv2.boxFilter(plane, cv2.CV_32F, size, dst=plane, borderType=cv2.BORDER_CONSTANT)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -205,6 +225,72 @@ def _solve_windows(
     return step, ncc, sigma
 
 
+def grow(disparity: Floats32, steps: int) -> Floats32:
+    """Continue known disparities (H, W) into the unknown, by planes fitted to the known nearby.
+
+    Args:
+        disparity: (H, W) px; NaN unknown.
+        steps: how many pixels the known area grows.
+    """
+    out = disparity
+    for _ in range(steps):
+        out = _grow_once(out)
+    return out.copy() if steps == 0 else out
+
+
+@numba.njit(cache=True, nogil=True)
+def _grow_once(disparity: Floats32) -> Floats32:  # pragma: no cover - compiled
+    """One pixel of growth: the plane through the known of a 7 x 7 window, or their mean."""
+    height, width = disparity.shape
+    out = disparity.copy()
+    for i in range(height):
+        for j in range(width):
+            if not np.isnan(disparity[i, j]):
+                continue
+            touching = 0
+            for di in range(-1, 2):
+                for dj in range(-1, 2):
+                    if 0 <= i + di < height and 0 <= j + dj < width:
+                        touching += not np.isnan(disparity[i + di, j + dj])
+            if touching >= 2:
+                out[i, j] = _extrapolated(disparity, i, j)
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def _extrapolated(disparity: Floats32, i: int, j: int) -> np.float32:  # pragma: no cover
+    """Value at (i, j) of the plane through the known pixels around it, kept within their range."""
+    height, width = disparity.shape
+    n, sx, sy, sz = 0.0, 0.0, 0.0, 0.0
+    sxx, sxy, syy, sxz, syz = 0.0, 0.0, 0.0, 0.0, 0.0
+    low, high = np.inf, -np.inf
+    for di in range(-3, 4):
+        for dj in range(-3, 4):
+            if not (0 <= i + di < height and 0 <= j + dj < width):
+                continue
+            z = np.float64(disparity[i + di, j + dj])
+            if np.isnan(z):
+                continue
+            n += 1.0
+            sx, sy, sz = sx + dj, sy + di, sz + z
+            sxx, sxy, syy = sxx + dj * dj, sxy + dj * di, syy + di * di
+            sxz, syz = sxz + dj * z, syz + di * z
+            low, high = min(low, z), max(high, z)
+    mean = sz / n
+    if n < 8.0:
+        return np.float32(mean)
+    sxz, syz = sxz - sx * mean, syz - sy * mean
+    sxx, sxy, syy = sxx - sx * sx / n, sxy - sx * sy / n, syy - sy * sy / n
+    determinant = sxx * syy - sxy * sxy
+    if determinant < 0.05 * sxx * syy:
+        return np.float32(mean)
+    a = (sxz * syy - syz * sxy) / determinant
+    b = (syz * sxx - sxz * sxy) / determinant
+    value = mean - a * sx / n - b * sy / n
+    reach = 0.5 * (high - low) + 0.25
+    return np.float32(min(max(value, low - reach), high + reach))
+
+
 @numba.njit(cache=True, nogil=True)
 def smooth_step(
     disparity: Floats32, step: Floats32, sigma: Floats32, smoothness: np.float32
@@ -233,8 +319,8 @@ def smooth_step(
             if np.isnan(centre):
                 continue
             total, weight = np.float32(0.0), np.float32(0.0)
-            for axis in range(2):
-                di, dj = (0, 1) if axis == 0 else (1, 0)
+            for way in range(4):
+                di, dj = _WAYS[way]
                 predicted, bend = _second_order(moved, i, j, di, dj)
                 if np.isnan(predicted):
                     continue
@@ -247,8 +333,8 @@ def smooth_step(
             trust = np.float32(0.0)
             if not np.isnan(step[i, j]):
                 trust = np.float32(0.01) / (sigma[i, j] * sigma[i, j] + np.float32(1e-4))
-            pull = smoothness * min(weight, np.float32(2.0)) * np.float32(0.5)
-            out[i, j] = (trust * centre + pull * target) / (trust + pull)
+            pull = smoothness * weight * np.float32(0.25)
+            out[i, j] = centre + _DAMPING * pull / (trust + pull) * (target - centre)
     return out
 
 

@@ -57,9 +57,9 @@ class ReconSettings:
     angle_min_deg: float = 9.0
     angle_max_deg: float = 27.0
     partners: int = 4
-    radius_px: int = 4
-    iterations: int = 8
-    smoothness: float = 5.0
+    radius_px: int = 3
+    iterations: int = 5
+    smoothness: float = 20.0
     ncc_min: float = 0.5
     agree_px: float = 0.7
     agreeing: int = 2

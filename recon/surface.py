@@ -50,7 +50,7 @@ class SurfaceSettings:
     """
 
     cell_spacings: float = 2.2
-    depth_max: int = 9
+    depth_max: int = 8
     evidence_spacings: float = 2.5
     component_share: float = 0.01
     threads: int = 1
@@ -96,7 +96,8 @@ def _trim(points: Points, vertices: Floats, triangles: Ints32, settings: Surface
     """Cut away what no point supports, drop small pieces, and carry the confidence over."""
     reach = settings.evidence_spacings * points.spacing_mm
     tree = cKDTree(points.positions)
-    distance, nearest = tree.query(vertices, distance_upper_bound=reach)
+    answer = tree.query(vertices, distance_upper_bound=reach)
+    distance, nearest = np.asarray(answer[0]), np.asarray(answer[1])
     near = np.isfinite(distance)
     kept = triangles[near[triangles].all(axis=1)]
     kept = kept[_large_pieces(kept, len(vertices), settings.component_share)]
@@ -249,8 +250,10 @@ def read_ply(path: Path) -> Scan:
     vertices = mesh.vertex.positions.numpy().astype(np.float32)
     triangles = mesh.triangle.indices.numpy().astype(np.int32)
     confidence = np.ones(len(vertices), np.float32)
-    if "confidence" in mesh.vertex:
-        confidence = mesh.vertex["confidence"].numpy().astype(np.float32).reshape(-1)
+    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        cloud = o3d.t.io.read_point_cloud(str(path))  # unlike the mesh reader, it keeps scalars
+    if "confidence" in cloud.point and len(cloud.point.positions) == len(vertices):
+        confidence = cloud.point["confidence"].numpy().astype(np.float32).reshape(-1)
     return Scan(vertices, triangles, _normals(vertices, triangles), confidence)
 
 

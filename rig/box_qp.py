@@ -69,7 +69,9 @@ def solve_box_qp(
     return out
 
 
-def kkt_residual(hessian: Floats, linear: Floats, bounds: tuple[Floats, Floats], x: Floats) -> float:
+def kkt_residual(
+    hessian: Floats, linear: Floats, bounds: tuple[Floats, Floats], x: Floats
+) -> float:
     """How far x (n,) is from optimal: `max |x - clip(x - gradient)|`, 0 at the exact minimum.
 
     Args:

@@ -6,14 +6,16 @@ import numpy as np
 from scipy import sparse
 
 from capture.arrays import Floats, Ints, check_shape
+from rig.box_qp import solve_box_qp
 from rig.gradient import gradient_operator
 from rig.template import Template
 from rig.transfer import factorised
 from rig.update import mean_vertex_area
 
 _RIDGE = 1e-3  # of the mean diagonal of the shapes' Gram matrix
-_CLEARLY_BETTER = 0.5  # another frame must halve the first one's fault to replace it
-_FAULT_FLOOR_MM2 = 0.05  # below this mean squared fault the first frame is neutral enough
+_CLEARLY_BETTER = 0.7  # of the first frame's fault: above it the first frame is neutral enough
+_CANDIDATES = 64  # frames, evenly spread, that are tried in a long take
+_OFTEN = 0.8  # of the frames that must see a vertex for it to have a say
 _BRIDGE_MM2 = 0.01  # how strongly the template's form carries over where nothing was seen
 
 
@@ -35,11 +37,11 @@ def align_frame(target: Floats, points: Floats, weights: Floats) -> tuple[Floats
 
 
 def choose_neutral_frame(template: Template, points: Floats, confidence: Floats) -> int:
-    """The frame from which every other frame is reached with weights that are not negative.
+    """The frame from which every other frame is best reached with weights in [0, 1].
 
-    Each frame is placed on the template and its displacement expressed in the template's shapes
-    without bounds. A frame's fault is how much negative motion the others would need, had it been
-    the neutral. The first frame, where takes begin at rest, is kept unless another is clearly better.
+    Each frame is placed on the template. A frame's fault is the mean squared residual of the others
+    when it stands for the neutral and the template's own shapes are added to it. The first frame,
+    where takes begin at rest, is kept unless another is clearly better.
 
     Args:
         template: the artist's rig.
@@ -49,24 +51,55 @@ def choose_neutral_frame(template: Template, points: Floats, confidence: Floats)
     moving = template.moves()
     seen = np.flatnonzero((confidence > 0).sum(axis=1) >= 0.5 * confidence.shape[1])
     if not moving.any() or len(seen) < 2:
-        return int(seen[0]) if len(seen) else 0
-    basis = template.deltas[moving].reshape(int(moving.sum()), -1)
-    gram = basis @ basis.T
+        return int(np.argmax(confidence.sum(axis=1)))
+    seen = seen[np.unique(np.linspace(0, len(seen) - 1, _CANDIDATES).round().astype(int))]
+    often = (confidence[seen] > 0).mean(axis=0)
+    kept = often >= min(_OFTEN, float(often.max()))
+    rigid = _rigid_modes(template.neutral[kept])
+    basis = template.deltas[moving][:, kept].reshape(int(moving.sum()), -1)
+    basis = basis - (basis @ rigid) @ rigid.T
+    offsets = _placed_offsets(template, points[seen], confidence[seen])[:, kept]
+    offsets = offsets.reshape(len(seen), -1)
+    offsets -= (offsets @ rigid) @ rigid.T
+    count = int(kept.sum())
+    gram = basis @ basis.T / count
     gram += _RIDGE * np.trace(gram) / len(gram) * np.eye(len(gram))
-    offsets = np.empty((len(seen), basis.shape[1]))
-    for row, frame in enumerate(seen):
-        square = confidence[frame].astype(np.float64) ** 2
-        rotation, translation = align_frame(template.neutral, points[frame], rigid_weights(template, square))
-        placed = points[frame] @ rotation.T + translation
-        offsets[row] = np.where(square[:, None] > 0, placed - template.neutral, 0.0).ravel()
-    amounts = np.linalg.solve(gram, basis @ offsets.T).T
-    size = np.diag(gram) / len(template.neutral)
-    lacking = np.minimum(amounts[None] - amounts[:, None], 0.0)  # candidate, other, shape
-    fault = (lacking**2 @ size).mean(axis=1)
+    linear = basis @ offsets.T / count
+    apart = offsets @ offsets.T / count
+    fault = np.empty(len(seen))
+    zeros = np.zeros((len(seen), len(gram)))
+    for candidate in range(len(seen)):
+        wanted = (linear - linear[:, candidate : candidate + 1]).T
+        amounts = solve_box_qp(gram[None], wanted, zeros, zeros + 1.0, zeros)
+        gain = (amounts * (2.0 * wanted - amounts @ gram)).sum(axis=1)
+        far = apart[candidate, candidate] + np.diag(apart) - 2.0 * apart[candidate]
+        fault[candidate] = (far - gain).mean()
     best = int(np.argmin(fault))
-    if fault[0] <= _FAULT_FLOOR_MM2 or fault[best] > _CLEARLY_BETTER * fault[0]:
-        best = 0
-    return int(seen[best])
+    return int(seen[best if fault[best] < _CLEARLY_BETTER * fault[0] else 0])
+
+
+def _placed_offsets(template: Template, points: Floats, confidence: Floats) -> Floats:
+    """Frames placed on the template, minus its neutral: (F, V, 3), mm; unseen vertices take their mean."""
+    offsets = np.empty(points.shape)
+    known = confidence > 0
+    for row, (frame, sure) in enumerate(zip(points, confidence, strict=True)):
+        square = sure.astype(np.float64) ** 2
+        rotation, shift = align_frame(template.neutral, frame, rigid_weights(template, square))
+        away = frame @ rotation.T + shift - template.neutral
+        offsets[row] = np.where(known[row][:, None], away, 0.0)
+    mean = offsets.sum(axis=0) / np.maximum(known.sum(axis=0), 1)[:, None]
+    filled: Floats = np.where(known[:, :, None], offsets, mean)
+    return filled
+
+
+def _rigid_modes(vertices: Floats) -> Floats:
+    """Orthonormal small motions (3 V, 6) of a rigid body: what an open jaw adds to a placement."""
+    x, y, z = (vertices - vertices.mean(axis=0)).T
+    zero = np.zeros_like(x)
+    turns = [np.stack(axis, axis=1) for axis in ((zero, -z, y), (z, zero, -x), (-y, x, zero))]
+    shifts = [np.tile(axis, (len(vertices), 1)) for axis in np.eye(3)]
+    modes: Floats = np.linalg.qr(np.stack([*turns, *shifts]).reshape(6, -1).T)[0]
+    return modes
 
 
 def rigid_weights(template: Template, weights: Floats) -> Floats:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from capture.arrays import Bools, Floats
+from capture.arrays import Bools, Floats, Ints32
 from capture.progress import Progress, silent
 from rig.gradient import gradient_operator
 from rig.template import Template
@@ -20,7 +20,7 @@ from rig.update import (
 )
 from rig.weights import WeightPriors, place_heads, solve_weights, sum_frames
 
-
+_NOISE_FLOOR_MM = 0.05  # what tracking is never better than
 _RETRANSFER_MM = 0.05  # root mean square move of the neutral that makes the transfer stale
 
 
@@ -103,6 +103,9 @@ class Schedule:
         iterations: most turns.
         relative_change: of the total energy, below which it stops.
         mask_tolerance: of a shape's extent, below which the template holds a vertex still.
+        variation: how far the actor's shapes depart from the transferred ones, as a share of their own
+            displacement. With the residual for noise it sets `relative_mm2` of the shapes step,
+            anew at every turn.
         weights: priors of the weights step.
         update: priors of the shapes step.
     """
@@ -110,6 +113,7 @@ class Schedule:
     iterations: int = 6
     relative_change: float = 0.005
     mask_tolerance: float = 1e-3
+    variation: float = 0.2
     weights: WeightPriors = field(default_factory=WeightPriors)
     update: UpdatePriors = field(default_factory=UpdatePriors)
 
@@ -168,11 +172,12 @@ def personalise(
     progress(0, schedule.iterations, "rig")
     for turn in range(schedule.iterations):
         evidence = Evidence(_undo_motion(fit, seen), seen.confidence, fit.weights)
+        priors = _priors(schedule, weighted_rms(fit.residuals(seen.points), seen.confidence))
         neutral, deltas = update_shapes(
-            fit.neutral, triangles, targets, support, evidence, schedule.update, fit.deltas
+            fit.neutral, triangles, targets, support, evidence, priors, fit.deltas
         )
         start = neutral - fit.neutral
-        turns.append(_measure(fit, (neutral, deltas, start), targets, seen, schedule, triangles))
+        turns.append(_measure(fit, (neutral, deltas, start), targets, seen, priors, triangles))
         fit = pose_frames(neutral, deltas, seen, schedule.weights, fit.weights)
         progress(turn + 1, schedule.iterations, "rig")
         settled = len(turns) > 1 and (
@@ -185,6 +190,12 @@ def personalise(
             carried = neutral
     progress(schedule.iterations, schedule.iterations, "rig")
     return first, fit, turns
+
+
+def _priors(schedule: Schedule, rms_mm: float) -> UpdatePriors:
+    """Shrinkage of Bayes: variance of the noise, per coordinate, over that of the shapes' departure."""
+    noise_mm2 = max(rms_mm, _NOISE_FLOOR_MM) ** 2 / 3.0
+    return replace(schedule.update, relative_mm2=noise_mm2 / schedule.variation**2)
 
 
 def _distance_rms(a: Floats, b: Floats) -> float:
@@ -204,14 +215,13 @@ def _measure(
     updated: tuple[Floats, Floats, Floats],
     targets: Floats,
     seen: Observations,
-    schedule: Schedule,
-    triangles: np.ndarray,
+    priors: UpdatePriors,
+    triangles: Ints32,
 ) -> Iteration:
     neutral, deltas, shift = updated
     away = Fit(neutral, deltas, fit.weights, fit.motions).residuals(seen.points)
     away = np.where(seen.confidence > 0, away, 0.0)
     frame, vertex = np.unravel_index(int(np.argmax(away)), away.shape)
-    priors = schedule.update
     operator = gradient_operator(fit.neutral, triangles)
     area = mean_vertex_area(fit.neutral, triangles)
     change = np.concatenate([shift[None], deltas - targets]).transpose(1, 0, 2)

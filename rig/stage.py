@@ -37,7 +37,10 @@ class RigSettings:
         sparsity_mm2: strength of (sum of a frame's weights)^2, as mean squared mm.
         smoothness: strength of the change of a weight between contiguous frames, as a fraction of
             its shape's mean squared displacement; 0 turns it off.
+        evidence: share of a frame's mean squared residual that a shape must explain to be active.
         debias: undo the shrinking that sparsity causes, keeping its choice of shapes.
+        variation: expected departure of the actor's shapes from the transferred ones, as a share of
+            their own displacement.
         gradient_mm2: strength of the shapes' deformation gradients against the template's.
         offset: strength of the shapes' displacements against the template's.
         neutral_offset: strength of the neutral against the chosen frame.
@@ -50,7 +53,9 @@ class RigSettings:
     relative_change: float = 0.01
     sparsity_mm2: float = 0.03
     smoothness: float = 0.002
+    evidence: float = 0.2
     debias: bool = True
+    variation: float = 0.2
     gradient_mm2: float = 1.0
     offset: float = 0.05
     neutral_offset: float = 0.05
@@ -63,6 +68,8 @@ class RigSettings:
             "relative_change": (0.0, 1.0),
             "sparsity_mm2": (0.0, 1e3),
             "smoothness": (0.0, 1e3),
+            "evidence": (0.0, 1.0),
+            "variation": (1e-3, 1e3),
             "gradient_mm2": (0.0, 1e6),
             "offset": (1e-6, 1e6),
             "neutral_offset": (1e-6, 1e6),
@@ -82,8 +89,12 @@ class RigSettings:
             iterations=self.iterations,
             relative_change=self.relative_change,
             mask_tolerance=self.mask_tolerance,
+            variation=self.variation,
             weights=WeightPriors(
-                sparsity_mm2=self.sparsity_mm2, smoothness=self.smoothness, debias=self.debias
+                sparsity_mm2=self.sparsity_mm2,
+                smoothness=self.smoothness,
+                evidence=self.evidence,
+                debias=self.debias,
             ),
             update=UpdatePriors(
                 gradient_mm2=self.gradient_mm2,
@@ -205,9 +216,7 @@ def _known_weights(
         )
     found: Floats = weights.columns(template.names)
     if found.min(initial=0.0) < 0.0 or found.max(initial=0.0) > 1.0:
-        raise InputError(
-            f"weights: must lie in 0..1, found {found.min():.4g}..{found.max():.4g}"
-        )
+        raise InputError(f"weights: must lie in 0..1, found {found.min():.4g}..{found.max():.4g}")
     return found
 
 

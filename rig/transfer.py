@@ -11,6 +11,8 @@ from rig.gradient import components, deformation_gradients, gradient_operator
 from rig.template import Template
 
 MASK_TOLERANCE = 1e-3  # of a shape's own extent: below it a vertex counts as static
+_LEAK_MM = 0.03  # motion of static vertices above which a shape is solved with them held
+_BRIDGE_STRENGTH = 10.0  # of virtual triangles against skin: closing matters more than stretch
 
 
 def transfer_shapes(
@@ -22,7 +24,8 @@ def transfer_shapes(
     actor's area-weighted gradient operator and F the template's deformation gradients: one
     factorisation of `G.T @ G` serves every shape and coordinate. The gauge is fixed once per
     connected component, at the vertices that the template's shape leaves alone (or, where it leaves
-    none, by the template's mean displacement). Triangles spanned between paired lids and lips make
+    none, by the template's mean displacement). A shape that would still move those vertices is solved
+    again on its own, with every one of them held. Triangles spanned between paired lids and lips make
     eyes and mouth shut on the actor when they shut on the template.
 
     Args:
@@ -40,8 +43,12 @@ def transfer_shapes(
     check_shape(template=(template.neutral, "V 3"), neutral=(neutral, "V 3"))
     check_finite(neutral=neutral)
     support = template.support(tolerance)
-    triangles = np.concatenate([template.mesh.triangles, virtual_triangles(template)])
+    bridges = virtual_triangles(template)
+    triangles = np.concatenate([template.mesh.triangles, bridges])
+    strength = np.ones(len(triangles))
+    strength[len(triangles) - len(bridges) :] = _BRIDGE_STRENGTH
     operator = gradient_operator(neutral, triangles)
+    operator = sparse.csr_array(sparse.diags_array(np.repeat(np.sqrt(strength), 3)) @ operator)
     rest = (operator @ neutral).reshape(-1, 3, 3)  # triangle, axis, coordinate
     labels = components(triangles, len(neutral))
     right = np.zeros((len(neutral), 3 * len(template.names)))
@@ -49,10 +56,15 @@ def transfer_shapes(
     for index, delta in enumerate(template.deltas):
         wanted = _wanted(template.neutral, np.where(support[index][:, None], delta, 0.0), triangles)
         right[:, 3 * index : 3 * index + 3] = transposed @ (rest @ wanted).reshape(-1, 3)
-    solved = _solve_anchored(transposed @ operator, right, labels)
+    laplacian = sparse.csr_array(transposed @ operator)
+    solved = _solve_anchored(laplacian, right, labels)
     deltas = np.ascontiguousarray(solved.reshape(len(neutral), -1, 3).transpose(1, 0, 2))
-    for index in range(len(deltas)):
-        deltas[index] = _settle(deltas[index], template.deltas[index], support[index], labels)
+    for index, source in enumerate(template.deltas):
+        settled, leak_mm = _settle(deltas[index], source, support[index], labels)
+        if leak_mm > _LEAK_MM:
+            wanted = right[:, 3 * index : 3 * index + 3]
+            _solve_held(laplacian, wanted, support[index], labels, settled)
+        deltas[index] = settled
     return deltas
 
 
@@ -110,12 +122,21 @@ def factorised(matrix: sparse.sparray) -> sparse.linalg.SuperLU:
     )
 
 
-def _settle(delta: Floats, source: Floats, support: Bools, labels: Ints) -> Floats:
-    """Fix each component's free translation and hold static vertices exactly still."""
-    still = ~support
+def _solve_held(
+    laplacian: sparse.csr_array, right: Floats, support: Bools, labels: Ints, out: Floats
+) -> None:
+    """Solve one shape with all its static vertices at zero, in components that have any."""
+    has_still = np.bincount(labels[~support], minlength=int(labels.max()) + 1) > 0
+    free = np.flatnonzero(support & has_still[labels] & (laplacian.diagonal() > 0.0))
+    if free.size:
+        out[free] = factorised(laplacian[free][:, free]).solve(right[free])
+
+
+def _settle(delta: Floats, source: Floats, support: Bools, labels: Ints) -> tuple[Floats, float]:
+    """Fix each component's free translation and hold static vertices still; how far they were off."""
     count = int(labels.max()) + 1
-    has_still = np.bincount(labels[still], minlength=count) > 0
-    chosen = np.where(has_still[labels], still, True)
+    has_still = np.bincount(labels[~support], minlength=count) > 0
+    chosen = ~support | ~has_still[labels]
     reference = np.where(has_still[labels][:, None], 0.0, source)
     total = np.bincount(labels[chosen], minlength=count)
     shift = np.stack(
@@ -125,4 +146,6 @@ def _settle(delta: Floats, source: Floats, support: Bools, labels: Ints) -> Floa
         ],
         axis=1,
     )
-    return np.where(support[:, None], delta + shift[labels], 0.0)
+    moved = delta + shift[labels]
+    leak_mm = float(np.linalg.norm(moved[~support], axis=1).max(initial=0.0))
+    return np.where(support[:, None], moved, 0.0), leak_mm

@@ -216,7 +216,9 @@ def solve_iterative(system: UpdateSystem, start: Floats, priors: UpdatePriors) -
     """
     lap, count = system.laplacian, len(system.starts) - 1
     inverse = np.empty_like(system.blocks)
-    run_ranges(_invert, count, system.starts, system.block_starts, system.blocks, lap.diagonal(), inverse)
+    run_ranges(
+        _invert, count, system.starts, system.block_starts, system.blocks, lap.diagonal(), inverse
+    )
     matrix = (system.starts, system.columns, system.block_starts, system.blocks)
     mesh = (system.position, lap.indptr, lap.indices, lap.data)
     solved = np.array(start, dtype=np.float64)
@@ -236,7 +238,9 @@ def solve_iterative(system: UpdateSystem, start: Floats, priors: UpdatePriors) -
         length = np.where(curvature > 0.0, energy / np.where(curvature > 0.0, curvature, 1.0), 0.0)
         solved += length * direction
         residual -= length * product
-        run_ranges(_precondition, count, system.starts, system.block_starts, inverse, residual, step)
+        run_ranges(
+            _precondition, count, system.starts, system.block_starts, inverse, residual, step
+        )
         renewed = (residual * step).sum(axis=0)
         direction *= np.where(energy > 0.0, renewed / np.where(energy > 0.0, energy, 1.0), 0.0)
         direction += step

@@ -28,9 +28,10 @@ class WeightPriors:
             sums over 6.7k vertices in cm is 0.0015 here.
         smoothness: strength of (w_f - w_(f-1))^2 between contiguous frames, as a fraction of each
             shape's own mean squared displacement; 0 turns it off.
-        evidence_mm2: what a shape must take off the frame's mean squared residual to stay active; the
-            least useful goes first, until all that remain earn their place. About 4 times the part
-            of the tracking error that one shape can imitate; 0 keeps every shape.
+        evidence: what a shape must take off a frame's mean squared residual to stay active, as a
+            share of that residual; the least useful goes first, until all that remain earn their
+            place. A shape imitates a few hundredths of a smooth tracking error by chance; 0 keeps
+            every shape.
         debias: solve again, without sparsity, with the shapes that sparsity left active: keeps its
             choice and takes back its shrinking.
         active_above: weight above which a shape counts as active.
@@ -40,7 +41,7 @@ class WeightPriors:
 
     sparsity_mm2: float = 0.03
     smoothness: float = 0.002
-    evidence_mm2: float = 0.008
+    evidence: float = 0.2
     debias: bool = True
     active_above: float = 0.01
     iterations: int = 60
@@ -126,14 +127,13 @@ def solve_weights(
     check_shape(cross=(sums.cross, "F * 3 3"), contiguous=(contiguous, "F"))
     weights = np.zeros((frames, shapes)) if start is None else np.array(start, dtype=np.float64)
     ceiling = np.where(sums.seen[:, None], np.ones((frames, shapes)), 0.0)
-    weights, hessian = _alternate(
-        sums, contiguous, priors, weights, ceiling, priors.sparsity_mm2
-    )
+    weights, hessian = _alternate(sums, contiguous, priors, weights, ceiling, priors.sparsity_mm2)
     if priors.debias and priors.sparsity_mm2 > 0.0:
         ceiling = ceiling * (weights > priors.active_above)
         weights, hessian = _alternate(sums, contiguous, priors, weights * ceiling, ceiling, 0.0)
-    while priors.evidence_mm2 > 0.0:
-        weakest, useless = _weakest(weights, hessian, priors.evidence_mm2)
+    while priors.evidence > 0.0:
+        wanted = priors.evidence * mean_square_residuals(sums, weights)
+        weakest, useless = _weakest(weights, hessian, wanted)
         if not useless.any():
             break
         ceiling[useless, weakest[useless]] = 0.0
@@ -144,8 +144,18 @@ def solve_weights(
     return weights, place_heads(sums, weights)
 
 
-def _weakest(weights: Floats, hessian: Floats, evidence_mm2: float) -> tuple[Ints, Bools]:
-    """Each frame's active shape whose loss would cost least, and whether that is too little.
+def mean_square_residuals(sums: FrameSums, weights: Floats) -> Floats:
+    """Mean squared residual (F,) of each frame at weights (F, B) and their best motion, mm^2."""
+    factors = np.concatenate([np.ones((len(weights), 1)), weights], axis=1)
+    posed = np.einsum("fk,fkab->fab", factors, sums.cross)
+    matched = np.einsum("fab,fba->f", posed, _rotations(sums, weights))
+    own = ((factors[:, None, :] @ sums.gram)[:, 0] * factors).sum(axis=1)
+    squares: Floats = np.maximum(own + np.einsum("faa->f", sums.inertia) - 2.0 * matched, 0.0)
+    return squares
+
+
+def _weakest(weights: Floats, hessian: Floats, wanted: Floats) -> tuple[Ints, Bools]:
+    """Each frame's active shape whose loss would cost least, and whether less than wanted (F,).
 
     Taking variable k out of a least-squares fit raises its mean squared residual by
     w_k^2 / (H^-1)_kk, the others and the head's rotation having been fitted again.
@@ -158,7 +168,7 @@ def _weakest(weights: Floats, hessian: Floats, evidence_mm2: float) -> tuple[Int
     spread = np.linalg.inv(reduced)[:, diagonal[:shapes], diagonal[:shapes]]
     cost = np.where(weights > 0.0, weights**2 / np.maximum(spread, 1e-300), np.inf)
     weakest = np.argmin(cost, axis=1)
-    return weakest, cost[np.arange(frames), weakest] < evidence_mm2
+    return weakest, cost[np.arange(frames), weakest] < wanted
 
 
 def place_heads(sums: FrameSums, weights: Floats) -> Floats:
@@ -208,7 +218,7 @@ def _alternate(
 
 
 def _linearise(sums: FrameSums, rotations: Floats, hessian: Floats) -> Floats:
-    """Fill the rows of a small rotation w about `rotations`, R exp([w]x), and give the linear term."""
+    """Fill the rows of a small rotation w, R exp([w]x), into `hessian`; give the linear term."""
     shapes = sums.cross.shape[1] - 1
     local = sums.cross @ rotations[:, None]  # mean of shape times (R^T point)^T
     turning = np.stack(

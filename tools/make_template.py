@@ -1,4 +1,4 @@
-"""Make a template.npz from a public face model: `python -m tools.make_template ict ICT.npz OUT.npz`."""
+"""Make a template from a public face model: `python -m tools.make_template ict ICT.npz OUT.npz`."""
 
 from __future__ import annotations
 
@@ -65,7 +65,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except LikenessError as error:
         print(error, file=sys.stderr)
         return error.exit_status
-    still = [name for name, moves in zip(template.names, template.moves(), strict=True) if not moves]
+    still = [
+        name for name, moves in zip(template.names, template.moves(), strict=True) if not moves
+    ]
     print(
         f"{given.out}: {len(template.neutral)} vertices, {len(template.polygons)} polygons, "
         f"{len(template.names)} shapes; no effect on these vertices: {', '.join(still) or 'none'}"

@@ -60,7 +60,9 @@ def perform(neutral: Floats, deltas: Floats, weights: Floats, motions: Floats) -
     return posed @ motions[:, :3, :3].transpose(0, 2, 1) + motions[:, None, :3, 3]
 
 
-def performance_of(vertices: Floats, polygons: Ints32, confidence: Floats | None = None) -> Performance:
+def performance_of(
+    vertices: Floats, polygons: Ints32, confidence: Floats | None = None
+) -> Performance:
     frames = len(vertices)
     sure = np.ones(vertices.shape[:2]) if confidence is None else confidence
     return Performance(

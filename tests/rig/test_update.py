@@ -28,7 +28,9 @@ def _scene(side: int = 8, frames: int = 7, holes: bool = True):
     support = template.support(1e-3)[:5]
     targets = np.where(support[:, :, None], template.deltas[:5], 0.0)
     weights = rng.uniform(0, 1, (frames, 5))
-    offsets = np.tensordot(weights, 1.3 * targets, axes=1) + rng.normal(0, 0.4, (frames, side**2, 3))
+    offsets = np.tensordot(weights, 1.3 * targets, axes=1) + rng.normal(
+        0, 0.4, (frames, side**2, 3)
+    )
     confidence = rng.uniform(0, 1, (frames, side**2)) if holes else np.ones((frames, side**2))
     if holes:
         confidence[:, :5] = 0.0
@@ -64,18 +66,14 @@ def test_equals_the_literal_system(holes: bool) -> None:
     template, targets, support, evidence = _scene(holes=holes)
     expected = _literal(template, targets, support, evidence, PRIORS)
     triangles = template.mesh.triangles
-    neutral, shapes = update_shapes(
-        template.neutral, triangles, targets, support, evidence, PRIORS
-    )
+    neutral, shapes = update_shapes(template.neutral, triangles, targets, support, evidence, PRIORS)
     assert np.abs(neutral - template.neutral - expected[0]).max() <= 1e-6
     assert np.abs(shapes - expected[1:]).max() <= 1e-6
 
 
 def test_direct_and_iterative_paths_agree() -> None:
     template, targets, support, evidence = _scene(20)
-    system = assemble(
-        template.neutral, template.mesh.triangles, targets, support, evidence, PRIORS
-    )
+    system = assemble(template.neutral, template.mesh.triangles, targets, support, evidence, PRIORS)
     direct = solve_direct(system)
     iterated = solve_iterative(system, np.zeros_like(system.right), PRIORS)
     assert np.abs(direct - iterated).max() <= 1e-6
@@ -90,7 +88,7 @@ def test_the_mask_holds_shapes_still_and_frees_the_neutral() -> None:
         template.neutral, template.mesh.triangles, targets, support, moved, PRIORS
     )
     assert (shapes[~support] == 0.0).all()
-    assert np.abs(neutral - template.neutral).min() > 0.1
+    assert np.linalg.norm(neutral - template.neutral, axis=1)[5:].min() > 0.5
 
 
 def test_true_shapes_are_recovered_from_enough_frames() -> None:
@@ -137,8 +135,6 @@ def test_a_face_meshed_more_finely_is_smoothed_over_the_same_distance() -> None:
 
 def test_says_when_it_does_not_converge() -> None:
     template, targets, support, evidence = _scene(20)
-    system = assemble(
-        template.neutral, template.mesh.triangles, targets, support, evidence, PRIORS
-    )
+    system = assemble(template.neutral, template.mesh.triangles, targets, support, evidence, PRIORS)
     with pytest.raises(SolveError, match="after 2 iterations"):
         solve_iterative(system, np.zeros_like(system.right), UpdatePriors(iterations=2))

@@ -4,10 +4,16 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
-from rig.weights import WeightPriors, place_heads, solve_weights, sum_frames
+from rig.weights import (
+    WeightPriors,
+    mean_square_residuals,
+    place_heads,
+    solve_weights,
+    sum_frames,
+)
 from tests.rig.grid_face import grid_template, perform, random_motions, smooth_field
 
-PLAIN = WeightPriors(sparsity_mm2=0.0, evidence_mm2=0.0, smoothness=0.0, iterations=500)
+PLAIN = WeightPriors(sparsity_mm2=0.0, evidence=0.0, smoothness=0.0, iterations=500)
 
 
 def _scene(frames: int, noise_mm: float, seed: int = 0):
@@ -33,7 +39,9 @@ def _literal_frame(neutral, deltas, points, confidence, sparsity, rounds=3000):
         flip = np.diag([1, 1, np.linalg.det(left @ right)])
         rotation = (left @ flip @ right).T
         local = (points - b) @ rotation
-        columns = (deltas - np.einsum("v,kva->ka", square, deltas)[:, None]).reshape(len(deltas), -1)
+        columns = (deltas - np.einsum("v,kva->ka", square, deltas)[:, None]).reshape(
+            len(deltas), -1
+        )
         target = (local - (neutral - square @ neutral)).ravel()
         matrix = np.vstack([(columns * root).T, np.sqrt(sparsity) * np.ones((1, len(deltas)))])
         right_side = np.append(target * root, 0.0)
@@ -54,7 +62,7 @@ def test_equals_the_literal_alternation(sparsity: float, holes: bool) -> None:
         confidence[:, rng.choice(400, 60, replace=False)] = 0.0
     sums = sum_frames(template.neutral, deltas, points, confidence)
     priors = WeightPriors(
-        sparsity_mm2=sparsity, evidence_mm2=0.0, smoothness=0.0, debias=False, tolerance=1e-12
+        sparsity_mm2=sparsity, evidence=0.0, smoothness=0.0, debias=False, tolerance=1e-12
     )
     solved, motions = solve_weights(sums, np.zeros(4, dtype=bool), priors)
     for frame in range(4):
@@ -94,8 +102,10 @@ def test_sparsity_leaves_fewer_shapes_and_debiasing_keeps_their_size() -> None:
     sums = sum_frames(template.neutral, deltas, points, np.ones(points.shape[:2]))
     alone = np.zeros(20, dtype=bool)
     plain, _ = solve_weights(sums, alone, PLAIN)
-    shrunk, _ = solve_weights(sums, alone, WeightPriors(sparsity_mm2=0.05, evidence_mm2=0.0, debias=False))
-    sparse, _ = solve_weights(sums, alone, WeightPriors(sparsity_mm2=0.05, evidence_mm2=0.0))
+    shrunk, _ = solve_weights(
+        sums, alone, WeightPriors(sparsity_mm2=0.05, evidence=0.0, debias=False)
+    )
+    sparse, _ = solve_weights(sums, alone, WeightPriors(sparsity_mm2=0.05, evidence=0.0))
     assert (sparse > 0.01).sum() < (plain > 0.01).sum()
     assert (sparse > 0.01).sum() <= (shrunk > 0.0).sum()
     assert sparse.sum() > shrunk.sum()
@@ -113,8 +123,35 @@ def test_smoothness_calms_contiguous_frames_and_stops_at_a_boundary() -> None:
     calm, _ = solve_weights(
         sums, linked, WeightPriors(sparsity_mm2=0.0, smoothness=2.0, iterations=500)
     )
-    assert np.abs(np.diff(calm[:6], axis=0)).mean() < 0.6 * np.abs(np.diff(rough[:6], axis=0)).mean()
+    assert (
+        np.abs(np.diff(calm[:6], axis=0)).mean() < 0.6 * np.abs(np.diff(rough[:6], axis=0)).mean()
+    )
     assert np.abs(calm[6:]).max() <= 1e-7
+
+
+def test_residuals_from_the_sums_are_those_of_the_vertices() -> None:
+    template, deltas, weights, _, points, rng = _scene(4, 0.5)
+    confidence = rng.uniform(0, 1, points.shape[:2])
+    sums = sum_frames(template.neutral, deltas, points, confidence)
+    heads = place_heads(sums, weights)
+    away = perform(template.neutral, deltas, weights, heads) - points
+    square = confidence**2
+    expected = (square * (away**2).sum(axis=2)).sum(axis=1) / square.sum(axis=1)
+    assert mean_square_residuals(sums, weights) == pytest.approx(expected, abs=1e-9)
+
+
+def test_shapes_that_earn_nothing_are_taken_out() -> None:
+    template, deltas, weights, _, points, rng = _scene(20, 0.0)
+    points = points + np.array([smooth_field(points[0], 0.5, rng) for _ in points])
+    sums = sum_frames(template.neutral, deltas, points, np.ones(points.shape[:2]))
+    alone = np.zeros(20, dtype=bool)
+    every, _ = solve_weights(sums, alone, PLAIN)
+    earning, _ = solve_weights(
+        sums, alone, WeightPriors(sparsity_mm2=0.0, evidence=0.1, smoothness=0.0)
+    )
+    unused = weights == 0.0
+    assert (earning[unused] > 0).sum() < 0.7 * (every[unused] > 0).sum()
+    assert (earning[weights > 0.3] > 0).all()
 
 
 def test_a_frame_without_confidence_is_at_rest() -> None:

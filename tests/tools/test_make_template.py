@@ -10,7 +10,9 @@ from tools.make_template import main
 
 
 def _archive(path: Path) -> None:
-    neutral = np.array([[0, 0, 0], [20, 0, 0], [20, 20, 0], [0, 20, 0], [5, 5, 5]], dtype=np.float32)
+    neutral = np.array(
+        [[0, 0, 0], [20, 0, 0], [20, 20, 0], [0, 20, 0], [5, 5, 5]], dtype=np.float32
+    )
     expr = np.zeros((2, 5, 3), dtype=np.float32)
     expr[0, :, 1] = 0.5
     np.savez(

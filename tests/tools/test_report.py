@@ -11,7 +11,11 @@ import numpy as np
 import pytest
 
 from capture.camera_file import write_cameras
+from capture.devices.simulated import Fault, FaultKind
 from capture.errors import InputError, TakeError
+from capture.recorder import RecordSettings
+from capture.session import Session, Shot, record_take
+from tests.capture.recording import array_of
 from tests.tools import report_cases as cases
 from tools.report import (
     ReportInputs,
@@ -23,6 +27,8 @@ from tools.report import (
     write_scan_page,
 )
 
+PRE = RecordSettings().pre_roll
+SMILE = Shot(slate="smile", kind="expression", frames=6, start_ns=5 * 10**9)
 _VOID = {"meta", "img", "input", "br", "rect", "line", "path", "circle"}
 
 
@@ -173,6 +179,22 @@ def test_whole_calibration_report_is_found_beside_the_cameras(tmp_path: Path) ->
     (tmp_path / "report.json").write_text(json.dumps(other), encoding="utf-8")
     inputs = ReportInputs(title="x", calibration=tmp_path / "cameras.json")
     assert inputs.calibration_report == short, "of another calibration"
+
+
+def test_session_leaves_out_takes_that_were_taken_again(tmp_path: Path) -> None:
+    session = Session.create(tmp_path / "s", name="tuesday")
+    faults = {"cam02": [Fault(FaultKind.LOSE_FRAME, k) for k in range(PRE + 1, PRE + 5)]}
+    record_take(session, SMILE, array_of(faults=faults), RecordSettings())
+    _, text = _read(report_for_take(session.folder, tmp_path / "r.html"))
+    assert "Not good: read the red lines first." in text
+    record_take(session, SMILE, array_of(), RecordSettings())
+    parsed, text = _read(report_for_take(session.folder, tmp_path / "r.html"))
+    assert parsed.sections == ["capture"]
+    assert "<h1>tuesday</h1>" in text
+    assert "smile_001" not in text
+    assert "Capture of smile_002:" in text
+    assert "Good: nothing here asks for a retake." in text
+    assert "clock drift, ppm" in text
 
 
 def test_nothing_at_all_is_still_a_page(tmp_path: Path) -> None:

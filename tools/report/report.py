@@ -8,6 +8,7 @@ from typing import Any
 
 from capture.camera import CameraArray
 from capture.progress import Progress, silent
+from capture.session import Session
 from tools.report.calibration import calibration_section
 from tools.report.inputs import ReportInputs, TakeInputs
 from tools.report.overview import layout_section, numbers_section, timing_section
@@ -52,14 +53,25 @@ def write_report(inputs: ReportInputs, out: Path, *, progress: Progress = silent
 def report_for_take(
     take: Path, out: Path, *, rig: Path | None = None, progress: Progress = silent
 ) -> Path:
-    """Report on one take: whatever its stages have made by now.
+    """Report on one take, or on all takes of a session: whatever the stages have made by now.
+
+    Of a session, takes that were taken again are left out.
 
     Args:
-        take: the take's folder.
+        take: the take's folder, or the session's.
         out: the file.
         rig: the folder that `likeness rig` wrote, or None.
         progress: told after each section.
+
+    Raises:
+        TakeError: when the folder is neither.
     """
+    if (Path(take) / "session.json").is_file():
+        session = Session.open(Path(take))
+        kept = [note.folder for note in session.takes() if not note.superseded]
+        takes = tuple(TakeInputs(folder=folder) for folder in kept)
+        inputs = ReportInputs(title=session.name, takes=takes, rig=rig)
+        return write_report(inputs, out, progress=progress)
     item = TakeInputs(folder=Path(take))
     cameras = item.folder / "cameras.json"
     inputs = ReportInputs(

@@ -28,6 +28,24 @@ class Reason(IntEnum):
     UNCERTAIN = 5  # predicted deviation too large
     LEFT_RIGHT = 6  # the right view's own match disagrees
     FRAGMENT = 7  # part of a patch too small to trust
+    EDGE = 8  # on the border of the matched area, where windows reach beyond the surface
+
+
+_RANGES = (
+    ("seed_px", 64, 4096),
+    ("seed_block", 1, 21),
+    ("radius", 1, 20),
+    ("iterations", 1, 200),
+    ("smoothness", 0.0, 1e3),
+    ("ncc_min", 0.0, 0.99),
+    ("contrast_min", 0.0, 100.0),
+    ("sigma_max_px", 1e-3, 10.0),
+    ("growth", 1, 20),
+    ("growth_px", 0, 50),
+    ("left_right_px", 0.01, 100.0),
+    ("fragment_px", 0, 10**7),
+    ("edge_px", 0, 50),
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,6 +65,7 @@ class DisparitySettings:
         growth_px: how far the known disparities grow before each round, px.
         left_right_px: largest disagreement with the right view's own disparity.
         fragment_px: patches smaller than this many pixels are dropped.
+        edge_px: width of the border of the matched area that is dropped.
     """
 
     seed_px: int = 480
@@ -61,13 +80,10 @@ class DisparitySettings:
     growth_px: int = 3
     left_right_px: float = 1.0
     fragment_px: int = 200
+    edge_px: int = 2
 
     def __post_init__(self) -> None:
-        for name, low, high in (
-            ("seed_px", 64, 4096), ("seed_block", 1, 21), ("radius", 1, 20), ("iterations", 1, 200),
-            ("smoothness", 0.0, 1e3), ("ncc_min", 0.0, 0.99), ("contrast_min", 0.0, 100.0),
-            ("sigma_max_px", 1e-3, 10.0), ("growth", 1, 20), ("growth_px", 0, 50), ("left_right_px", 0.01, 100.0), ("fragment_px", 0, 10**7),
-        ):  # fmt: skip
+        for name, low, high in _RANGES:
             value = getattr(self, name)
             if not low <= value <= high:
                 raise SettingsError(f"{name}: expected {low}..{high}, found {value}")
@@ -236,6 +252,9 @@ def _judge(
     fail(seen - disparity > settings.left_right_px, Reason.LEFT_RIGHT)
     kept = np.where(reason == 0, disparity, np.float32(np.nan))
     fail(_fragments(kept, settings.fragment_px), Reason.FRAGMENT)
+    size = 2 * settings.edge_px + 1
+    inner = cv2.erode((reason == 0).astype(np.uint8), np.ones((size, size), np.uint8))
+    fail(inner == 0, Reason.EDGE)
     kept = np.where(reason == 0, disparity, np.float32(np.nan))
     return DisparityMap(kept, refined.ncc, refined.sigma_px, reason)
 

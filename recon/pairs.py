@@ -102,8 +102,8 @@ def select_pairs(
     """
     settings = settings or PairSettings()
     rays = np.stack([camera.centre - centre for camera in cameras])
-    rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
-    angles: Floats = np.degrees(np.arccos(np.clip(rays @ rays.T, -1.0, 1.0)))
+    unit: Floats = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    angles: Floats = np.degrees(np.arccos(np.clip(unit @ unit.T, -1.0, 1.0)))
     chosen: set[tuple[int, int]] = set()
     for index in range(len(cameras)):
         chosen.update(_partners(index, angles[index], settings))
@@ -114,7 +114,9 @@ def select_pairs(
 def _partners(index: int, angles: Floats, settings: PairSettings) -> list[tuple[int, int]]:
     """Unordered pairs of one camera with its best partners."""
     others = [other for other in range(len(angles)) if other != index]
-    others.sort(key=lambda other: (round(abs(float(angles[other]) - settings.angle_best_deg), 6), other))
+    others.sort(
+        key=lambda other: (round(abs(float(angles[other]) - settings.angle_best_deg), 6), other)
+    )
     inside = [o for o in others if settings.angle_min_deg <= angles[o] <= settings.angle_max_deg]
     if not inside:
         low = 0.25 * settings.angle_min_deg

@@ -181,7 +181,7 @@ def _search(
     factor = 2 ** (len(levels) - 1)
     small = (limits[0] / factor, limits[1] / factor)
     matching = replace(
-        settings.matching, seed_px=_SEARCH_PX, iterations=3, growth=1, fragment_px=40
+        settings.matching, seed_px=_SEARCH_PX, iterations=3, growth=1, fragment_px=40, edge_px=0
     )
     coarse = match_pair(*levels[-1], small, matching).disparity
     known = np.isfinite(coarse)

@@ -251,7 +251,7 @@ def read_ply(path: Path) -> Scan:
     triangles = mesh.triangle.indices.numpy().astype(np.int32)
     confidence = np.ones(len(vertices), np.float32)
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-        cloud = o3d.t.io.read_point_cloud(str(path))  # unlike the mesh reader, it keeps scalars
+        cloud = o3d.t.io.read_point_cloud(Path(path))  # unlike the mesh reader, it keeps scalars
     if "confidence" in cloud.point and len(cloud.point.positions) == len(vertices):
         confidence = cloud.point["confidence"].numpy().astype(np.float32).reshape(-1)
     return Scan(vertices, triangles, _normals(vertices, triangles), confidence)

@@ -1,1 +1,6 @@
 """The face rig: template transfer, weights, blendshape update, export."""
+
+import os
+
+# open3d loads an older TBB, at which numba would warn; OpenMP is there on every machine.
+os.environ.setdefault("NUMBA_THREADING_LAYER", "omp")

@@ -7,17 +7,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from capture.arrays import Bools, Floats, Ints32, check_shape
+from capture.arrays import Bools, Floats, Ints, Ints32, check_shape
 from capture.errors import SolveError
 from capture.progress import Progress, silent
 from recon.mesh import vertex_normals
 from recon.surface import Scan
+from track.contact import Contacts, find_contacts
 from track.landmark_file import Landmarks
 from track.laplacian import Constraints, LaplacianDeformer, Stiffness
 from track.surface_match import Matches, MatchSurface, near_border
 from track.visibility import count_views
 
 _BORDER_MM = 3.0  # the last millimetres of a scan belong to its noise
+_CONTACT = 2.0  # weight of a touching vertex against a match of full trust
 _FEWEST = 50  # matches without which a step says nothing
 
 
@@ -61,7 +63,8 @@ class NonrigidFit:
     Each step meets, for every vertex that a camera sees, the scan's point nearest in position and
     normal, and solves Ma et al.'s Eq. 1 with the step's stiffness. The stiffness holds against the
     previous step's shape, so that the total deformation is not resisted and only has to be smooth
-    step by step. What no camera sees, and what has no scan, follows by the Laplacian.
+    step by step. What no camera sees, and what has no scan, follows by the Laplacian. Vertices that
+    touch in the template, as closed lips do, are kept touching.
 
     References:
         Ma et al. 2016, Sec. 2.2. Amberg et al. 2007, "Optimal step nonrigid ICP algorithms for
@@ -92,11 +95,14 @@ class NonrigidFit:
             SolveError: when too little of the template meets the scan.
         """
         vertices = start
+        contacts = find_contacts(start, self._triangles)
         seen = count_views(vertices, self._triangles, self._eyes) > 0
         for index, step in enumerate(steps):
             if index == len(steps) // 2:
                 seen = count_views(vertices, self._triangles, self._eyes) > 0
-            constraints = self._constraints(vertices, seen, step, landmarks)
+            constraints = self._constraints(vertices, seen, step)
+            constraints = _with_contacts(constraints, contacts, vertices)
+            constraints = _with_landmarks(constraints, landmarks, step.landmark_share)
             deformer = LaplacianDeformer(
                 vertices, self._triangles, Stiffness(bending_mm=step.bending_mm)
             )
@@ -107,9 +113,7 @@ class NonrigidFit:
             vertices=vertices, residual_mm=self._residual(vertices, seen, steps[-1]), seen=seen
         )
 
-    def _constraints(
-        self, vertices: Floats, seen: Bools, step: Step, landmarks: Landmarks | None
-    ) -> Constraints:
+    def _constraints(self, vertices: Floats, seen: Bools, step: Step) -> Constraints:
         asked, matches, weights = self._match(vertices, seen, step)
         kept = weights > 0.0
         count = int(kept.sum())
@@ -119,19 +123,7 @@ class NonrigidFit:
                 f"{step.reach_mm:.0f} mm; is frame 0 this actor's neutral? Otherwise place the "
                 "template by --landmarks"
             )
-        corners, targets = asked[kept], matches.points[kept]
-        weights = weights[kept] / weights[kept].sum()
-        if landmarks is not None and step.landmark_share > 0.0:
-            marks = len(landmarks.vertices)
-            corners = np.concatenate([corners, landmarks.vertices])
-            targets = np.concatenate([targets, landmarks.positions])
-            weights = np.concatenate([weights, np.full(marks, step.landmark_share / marks)])
-        return Constraints(
-            corners=np.repeat(corners[:, None], 3, axis=1),
-            barycentric=np.tile([1.0, 0.0, 0.0], (len(corners), 1)),
-            targets=targets,
-            weights=weights * len(weights),
-        )
+        return _vertex_constraints(asked[kept], matches.points[kept], weights[kept])
 
     def _match(self, vertices: Floats, seen: Bools, step: Step) -> tuple[Ints32, Matches, Floats]:
         """Seen vertices, what they meet, and how much each match weighs (0: dropped)."""
@@ -152,3 +144,47 @@ class NonrigidFit:
         kept = weights > 0.0
         residual[asked[kept]] = matches.distance_mm[kept]
         return residual
+
+
+def _vertex_constraints(vertices: Ints | Ints32, targets: Floats, weights: Floats) -> Constraints:
+    return Constraints(
+        corners=np.repeat(vertices[:, None], 3, axis=1).astype(np.int64),
+        barycentric=np.tile([1.0, 0.0, 0.0], (len(vertices), 1)),
+        targets=targets,
+        weights=weights,
+    )
+
+
+def _with_contacts(constraints: Constraints, contacts: Contacts, vertices: Floats) -> Constraints:
+    """What touched in the template is drawn together about its middle, wherever that is."""
+    return _joined(
+        constraints,
+        contacts.pairs.ravel(),
+        contacts.targets(vertices).reshape(-1, 3),
+        np.full(2 * len(contacts.pairs), _CONTACT),
+    )
+
+
+def _with_landmarks(
+    constraints: Constraints, landmarks: Landmarks | None, share: float
+) -> Constraints:
+    """Marks weigh `share` of all else together."""
+    if landmarks is None or share <= 0.0:
+        return constraints
+    count = len(landmarks.vertices)
+    weight = share * float(constraints.weights.sum()) / count
+    return _joined(constraints, landmarks.vertices, landmarks.positions, np.full(count, weight))
+
+
+def _joined(
+    constraints: Constraints, vertices: Ints, targets: Floats, weights: Floats
+) -> Constraints:
+    """More vertex constraints; weights are brought to a mean of 1, as the stiffness expects."""
+    more = _vertex_constraints(vertices, targets, weights)
+    every = np.concatenate([constraints.weights, more.weights])
+    return Constraints(
+        corners=np.concatenate([constraints.corners, more.corners]).astype(np.int64),
+        barycentric=np.concatenate([constraints.barycentric, more.barycentric]),
+        targets=np.concatenate([constraints.targets, more.targets]),
+        weights=every / every.mean(),
+    )

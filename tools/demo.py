@@ -21,7 +21,7 @@ from capture.settings import settings_to_toml
 from capture.take import Take
 from recon.array_solver import CalibrateSettings
 from recon.board import read_board
-from recon.calibrate import calibrate
+from recon.calibrate import calibrate, report_path
 from recon.mesh import write_obj
 from recon.scan import ReconSettings, reconstruct
 from rig.export import export
@@ -86,7 +86,7 @@ def run_demo(out: Path, settings: DemoSettings, *, progress: Progress = silent) 
         cameras = calibrate(
             session.take(BOARD), board, CalibrateSettings(), out / "cameras.json", progress=progress
         )
-        report = json.loads((out / "cameras.json").read_text(encoding="utf-8"))["report"]
+        report = json.loads(report_path(out / "cameras.json").read_text(encoding="utf-8"))
         write_calibration_page(cameras, report, out / "cameras.html")
         for take in faces:
             take.set_cameras(cameras)
@@ -115,7 +115,7 @@ def run_demo(out: Path, settings: DemoSettings, *, progress: Progress = silent) 
         inputs = ReportInputs(
             title=f"likeness demo, {session.name}",
             takes=tuple(TakeInputs(folder=t.folder, errors=errors[t.name]) for t in faces),
-            calibration=out / "cameras.json",
+            calibration=report_path(out / "cameras.json"),
             rig=out / "rig",
             template=out / "template.npz",
             timings=watch.seconds,

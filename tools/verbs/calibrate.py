@@ -17,7 +17,7 @@ from capture.progress import Progress
 from capture.take import Take
 from recon.array_solver import CalibrateSettings
 from recon.board import read_board
-from recon.calibrate import calibrate
+from recon.calibrate import calibrate, report_path
 from tools.report import write_calibration_page
 from tools.verbs.options import Options
 
@@ -44,7 +44,7 @@ def run(arguments: Arguments, progress: Progress) -> dict[str, Any]:
     take = Take.open(arguments.take)
     board = read_board(arguments.board)
     cameras = calibrate(take, board, arguments.settings, arguments.out, progress=progress)
-    report = json.loads(arguments.out.read_text(encoding="utf-8"))["report"]
+    report = json.loads(report_path(arguments.out).read_text(encoding="utf-8"))
     page = arguments.out.with_suffix(".html")
     write_calibration_page(cameras, report, page)
     plain = {k: v for k, v in report.items() if isinstance(v, str | int | float | bool)}

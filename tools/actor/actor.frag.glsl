@@ -75,7 +75,7 @@ Surface surface() {
 #ifdef PLAIN
     s.albedo = vertex_paint.x * mix(factor, 1.0, 0.6 * vertex_wet);
     s.tilt = vec3(a + vec2(c.x, 0.0) + vec2(0.0, b.y), b.x + c.y) * dry;
-    s.specular = mix(gloss * 0.055, 0.02, vertex_wet);
+    s.specular = mix(gloss * 0.085, 0.02, vertex_wet);
     s.sharpness = 20.0;
     return s;
 #else
@@ -89,7 +89,7 @@ Surface surface() {
     s.albedo = mix(s.albedo, 0.09 + 0.30 * detail.w * detail.w + 0.06 * (factor - 0.9), 0.88 * hair);
     s.tilt = vec3(a + vec2(c.x, 0.0) + vec2(0.0, b.y), b.x + c.y) * dry * (1.0 - 0.6 * lip);
     s.tilt.x += 0.25 * wrinkle * lip;
-    s.specular = gloss * mix(0.055, 0.10, lip) * (1.0 - 0.6 * hair) * (1.0 - 0.8 * brow);
+    s.specular = gloss * mix(0.085, 0.14, lip) * (1.0 - 0.6 * hair) * (1.0 - 0.8 * brow);
     s.specular = mix(s.specular, 0.02, vertex_wet);
     s.sharpness = mix(20.0, 42.0, lip);
     return s;

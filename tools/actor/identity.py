@@ -45,7 +45,7 @@ class Identity:
     chin_forward: float = 0.0
     brow_ridge: float = 2.0
     eye_spacing: float = 0.0
-    eye_opening: float = 9.8
+    eye_opening: float = 9.2
     eye_tilt: float = 1.5
     nose_length: float = 0.0
     nose_height: float = 22.0

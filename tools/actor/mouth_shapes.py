@@ -50,7 +50,7 @@ def _jaw_weights(field: Field) -> Floats:
     wanted[chin] = 1.0
     held = chin | still
     place = np.abs(x[slit.upper]) / field.who.mouth_half_width
-    bend = np.clip(place, 0.0, 1.0) ** 5
+    bend = np.clip(place, 0.0, 1.0) ** 3.5
     wanted[slit.upper, 0] = _CORNER_SHARE * bend
     wanted[slit.lower, 0] = 1.0 - (1.0 - _CORNER_SHARE) * bend
     wanted[slit.corners, 0] = _CORNER_SHARE

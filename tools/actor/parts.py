@@ -48,7 +48,7 @@ def eyeball(centre: Floats) -> tuple[Mesh, Floats]:
     around = 2.0 * np.pi * np.arange(_SECTORS) / _SECTORS
     radius = np.full(_RINGS, BALL_RADIUS)
     # The cornea is a smaller sphere set forward; the larger radius of the two shows.
-    forward = BALL_RADIUS + 1.1 - _CORNEA_RADIUS
+    forward = BALL_RADIUS + 0.5 - _CORNEA_RADIUS
     inside = np.maximum(_CORNEA_RADIUS**2 - (forward * np.sin(angle)) ** 2, 0.0)
     bulge = forward * np.cos(angle) + np.sqrt(inside)
     radius = np.where(angle < 0.75, np.maximum(radius, bulge), radius)
@@ -74,7 +74,7 @@ def teeth(stomion: Floats, *, upper: bool) -> tuple[Mesh, Floats]:
     arc = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(z)))])
     arc -= arc.mean()
     up = 1.0 if upper else -1.0
-    edge = stomion[1] - (2.8 if upper else 1.6)
+    edge = stomion[1] - (3.6 if upper else 0.6)
     heights = np.array([11.0, 8.5, 5.0, 2.0, 0.3, 0.0, 0.6, 6.0])
     inward = np.array([1.2, 0.0, 0.0, 0.2, 0.7, 1.6, 2.6, 5.0])
     gap = 0.5 * (1.0 - np.abs(np.cos(np.pi * arc / 7.6)) ** 0.35)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import CubicSpline, PchipInterpolator
+from scipy.interpolate import Akima1DInterpolator, PchipInterpolator
 
 from capture.arrays import Floats, Ints
 from tools.actor.identity import Identity
@@ -18,7 +18,7 @@ from tools.actor.lumps import lumps
 
 EYE_LEVEL = 8.0
 BALL_RADIUS = 12.6
-LID_RADIUS = 13.9  # the skin of the lids, from the centre of the ball
+LID_RADIUS = 14.0  # the skin of the lids, from the centre of the ball
 _STOMION = -58.0
 _EYE_HALF = 14.0
 
@@ -35,8 +35,9 @@ _CONTOURS = (
     (84, -89.0, 89.0, 55.0, -18.0, -74.0, 2.10, -74.0, -82.0, 48.0),
     (89, -103.0, 81.0, 48.0, -18.0, -72.0, 2.10, -86.0, -92.0, 46.5),
     (93, -108.0, 60.0, 45.5, -18.0, -70.0, 2.05, -97.0, -104.0, 45.0),
-    (97, -119.0, 34.0, 48.0, -16.0, -70.0, 2.00, -114.0, -118.0, 47.5),
-    (103, -175.0, 26.0, 56.0, -18.0, -80.0, 2.00, -172.0, -174.0, 56.0),
+    (97, -119.0, 34.0, 46.5, -16.0, -70.0, 2.00, -114.0, -118.0, 47.0),
+    (100, -148.0, 28.0, 49.0, -18.0, -76.0, 2.00, -146.0, -144.0, 52.0),
+    (103, -205.0, 42.0, 96.0, -24.0, -98.0, 2.20, -196.0, -190.0, 94.0),
 )
 _CROWN_ROWS = ((0, 90.0), (4, 69.0), (8, 47.0), (13, 24.0))  # row, latitude in degrees
 
@@ -102,7 +103,7 @@ def _angles() -> Floats:
 
 
 def _loft() -> Floats:
-    """(ROWS, COLUMNS, 3): key contours joined along the columns by cubic splines."""
+    """(ROWS, COLUMNS, 3): key contours joined along columns by splines that do not overshoot."""
     angle = _angles()
     sine, cosine = np.sin(angle), np.cos(angle)
     rows, contours = [], []
@@ -123,7 +124,7 @@ def _loft() -> Floats:
         x, z = breadth * radius * sine, middle_z + depth * radius * cosine
         rows.append(row)
         contours.append(np.stack([x, y, z], axis=1))
-    lofted: Floats = CubicSpline(rows, np.stack(contours), axis=0, bc_type="natural")(
+    lofted: Floats = Akima1DInterpolator(rows, np.stack(contours), axis=0, method="makima")(
         np.arange(ROWS)
     )
     lofted[0, :, 0] = 0.0
@@ -237,7 +238,10 @@ def _ears(points: Floats) -> Floats:
     mask = smooth_step(1.22, 0.88, reach)
     rear = smooth_step(0.75, -0.5, across)
     lobe = smooth_step(-1.0, -0.3, along) * 0.4 + 0.6
-    height = mask * (1.5 + 10.0 * rear * smooth_step(0.1, 0.9, reach) * lobe)
+    rim = 10.0 * smooth_step(0.3, 0.85, reach) * lobe + 2.5 * bump((reach - 0.92) / 0.14)
+    fold = 3.0 * bump((reach - 0.55) / 0.12) * smooth_step(-0.6, 0.2, along)
+    shell = 4.0 * bump(along / 0.32, (across + 0.12) / 0.36)
+    height = mask * (2.0 + rear * (rim + fold) - shell)
     out = points.copy()
     out[:, 0] += np.sign(x) * height * smooth_step(30.0, 55.0, np.abs(x))
     out[:, 2] -= 0.5 * height * rear * smooth_step(30.0, 55.0, np.abs(x))
@@ -267,7 +271,7 @@ def _eye(points: Floats, lattice: Lattice, slit: Slit, who: Identity) -> tuple[F
     rise = rise * np.exp(-((np.abs(offset) / 4.5) ** 1.5))
     tilt = who.eye_tilt * np.clip(place * side, -1.0, 1.6) * bump(place / 1.6, offset / 7.0)
     out[:, 1] += np.where(near, rise + tilt, 0.0)
-    ball = np.array([centre_x, EYE_LEVEL + 1.6, 64.8])
+    ball = np.array([centre_x, EYE_LEVEL + 1.9, 64.8])
     x, y, z = out.T
     apart = np.hypot(x - ball[0], (y - ball[1]))
     cap = np.sqrt(np.maximum(LID_RADIUS**2 - apart**2, 0.0))

@@ -77,7 +77,9 @@ def paint_skin(lattice: Lattice, sculpture: Sculpture, normals: Floats, who: Ide
         albedo[eye.lower] = who.skin * 0.62
         albedo[eye.corners] = who.skin * 0.5
     hair = smooth_step(0.0, 1.1, _hairline(points) + 0.10 * wave(points, who.seed + 8, 16.0))
-    return Paint(albedo, _brows(points, who), hair * outer, lip, wet)
+    ear = smooth_step(1.2, 0.9, np.hypot((z + 25.0) / 26.0, (y + 6.0) / 35.0))
+    hair *= outer * (1.0 - ear * smooth_step(68.0, 75.0, wide))
+    return Paint(albedo, _brows(points, who), hair, lip, wet)
 
 
 def _hollows(lattice: Lattice, points: Floats, normals: Floats) -> Floats:
@@ -131,8 +133,7 @@ def _hairline(points: Floats) -> Floats:
     line = 66.0 - 2.0 * np.exp(-((np.abs(x) - 30.0) ** 2) / 200.0) - rear**1.4 * 120.0
     line = np.where(z < -30, -55.0, line)
     temple = 22.0 * bump((z - 12.0) / 12.0)
-    ear = bump((np.abs(x) - 80.0) / 14.0) * bump((z + 24.0) / 22.0, (y + 8.0) / 33.0)
-    grown: Floats = 0.5 + (y - line + temple * (y < 40)) / 22.0 - 2.0 * ear
+    grown: Floats = 0.5 + (y - line + temple * (y < 40)) / 22.0
     return grown
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from capture.arrays import Image
 from capture.errors import SettingsError, TakeError
-from capture.mcap import FrameHeader
+from capture.frame_header import FrameHeader
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from capture.errors import LikenessError, TakeError, raise_all
-from capture.mcap import ImageLayout
+from capture.frame_header import ImageLayout
 from capture.names import is_plain_name
 from capture.product import replacing
 

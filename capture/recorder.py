@@ -11,8 +11,8 @@ from capture.collate import Collator, TriggerTrain
 from capture.devices.protocol import Device, DeviceArray, TriggerKind, TriggerSpec
 from capture.errors import SettingsError
 from capture.frame import FrameEvent
+from capture.frame_header import FrameHeader
 from capture.ledger import Ledger
-from capture.mcap import FrameHeader
 from capture.settings import check_range
 
 Sink = Callable[[str, FrameHeader, Image], None]

@@ -9,8 +9,9 @@ from types import TracebackType
 
 from capture.arrays import Image
 from capture.errors import TakeError
+from capture.frame_header import FrameHeader, ImageLayout
 from capture.manifest import DeviceEntry, TakeManifest, write_manifest
-from capture.mcap import FrameHeader, FrameWriter, ImageLayout
+from capture.mcap import FrameWriter
 from capture.product import hash_file
 from capture.take import MANIFEST
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from capture.arrays import Image
 from capture.errors import TakeError
-from capture.mcap import ImageLayout
+from capture.frame_header import ImageLayout
 
 _MAGIC = b"\x89PNG\r\n\x1a\n"
 _LARGEST_PX = 1 << 28  # 16384 x 16384

@@ -11,7 +11,7 @@ from pathlib import Path
 from capture.camera import CameraArray
 from capture.camera_file import read_cameras
 from capture.errors import InputError, TakeError, raise_all
-from capture.mcap import ImageLayout
+from capture.frame_header import ImageLayout
 from capture.names import is_plain_name
 from capture.product import hash_file
 from capture.progress import Progress, silent

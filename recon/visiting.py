@@ -18,9 +18,9 @@ from pathlib import Path
 
 from capture.camera_file import write_cameras
 from capture.errors import TakeError
+from capture.frame_header import FrameHeader
 from capture.ledger import all_present, write_ledger
 from capture.manifest import DeviceEntry, TakeManifest
-from capture.mcap import FrameHeader
 from capture.product import record_path, replacing, stage_record, write_record
 from capture.progress import Progress, silent
 from capture.take import MANIFEST, Take

@@ -16,7 +16,7 @@ from typing import Protocol
 from capture.arrays import Image
 from capture.errors import DeviceError, SettingsError, TakeError, raise_all
 from capture.frame import FrameEvent
-from capture.mcap import ImageLayout
+from capture.frame_header import ImageLayout
 from capture.names import is_plain_name
 
 

@@ -21,7 +21,7 @@ from capture.camera import Camera, CameraArray
 from capture.devices.protocol import ClockSample, DeviceArray, DeviceInfo, TriggerKind, TriggerSpec
 from capture.errors import DeviceError, SettingsError
 from capture.frame import Clock, FrameEvent
-from capture.mcap import ImageLayout
+from capture.frame_header import ImageLayout
 
 SCENE_GROUP = "likeness.scenes"
 

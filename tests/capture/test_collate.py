@@ -13,8 +13,8 @@ from capture.devices.protocol import DeviceInfo, TriggerKind
 from capture.devices.simulated import Fault, FaultKind, SimulatedSettings
 from capture.errors import SettingsError
 from capture.frame import FrameEvent
+from capture.frame_header import ImageLayout
 from capture.ledger import Oddity, Verdict
-from capture.mcap import ImageLayout
 from capture.recorder import RecordSettings
 from tests.capture.recording import array_of, cameras, misplaced, record, verdicts
 

@@ -13,7 +13,8 @@ from mcap.reader import NonSeekingReader, SeekingReader
 from mcap.stream_reader import CRCValidationError
 
 from capture.errors import TakeError
-from capture.mcap import HEADER_BYTES, FrameHeader, FrameReader, FrameWriter, ImageLayout
+from capture.frame_header import HEADER_BYTES, FrameHeader, ImageLayout
+from capture.mcap import FrameReader, FrameWriter
 from tests.capture.refusals import refusal
 
 LAYOUTS = [

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 
 from capture.camera import CameraArray
 from capture.errors import CameraError, TakeError
+from capture.frame_header import FrameHeader, ImageLayout
 from capture.manifest import TakeManifest, read_manifest
-from capture.mcap import FrameHeader, ImageLayout
 from capture.take import Take
 from capture.take_writer import TakeWriter
 from tests.capture.refusals import refusal

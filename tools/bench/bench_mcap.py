@@ -19,7 +19,8 @@ from mcap.reader import SeekingReader
 from mcap.writer import CompressionType, Writer
 
 from capture.arrays import Image
-from capture.mcap import FrameHeader, FrameReader, FrameWriter, ImageLayout
+from capture.frame_header import FrameHeader, ImageLayout
+from capture.mcap import FrameReader, FrameWriter
 
 
 def main() -> None:

@@ -77,7 +77,7 @@ def scene_centre(cameras: CameraArray) -> Floats:
             "the optical axes of the cameras are parallel and meet nowhere; set centre_mm to the "
             "place of the face in world space"
         )
-    centre: Floats = np.linalg.solve(system, target)
+    centre = np.asarray(np.linalg.solve(system, target), dtype=np.float64)
     behind = [camera.name for camera in cameras if camera.depths(centre[None])[0] <= 0]
     if behind:
         raise CameraError(

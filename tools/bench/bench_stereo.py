@@ -3,9 +3,10 @@
     python -m tools.bench.bench_stereo TAKE FRAME [--score SCORE_SCAN.py] [--out FOLDER] [--ours]
 
 The opponent is what sixty lines of OpenCV and Open3D give: fourteen pairs, semi-global matching
-(eight paths) at full resolution, points of one pair kept where another pair has one within 0.5 mm,
-Poisson at depth 9. `--score` names a script called with TAKE FRAME SCAN that prints one JSON line, such as
-score_scan.py. Printed: seconds of wall clock and of processor by step, peak memory, and the scores.
+(eight paths) at full resolution, points of one pair kept where another has one within 0.5 mm,
+Poisson at depth 9. `--score` names a script called with TAKE FRAME SCAN that prints one JSON line,
+such as score_scan.py. Printed: seconds of wall clock and of processor by step, the peak memory of
+the process so far, and the scores.
 """
 
 from __future__ import annotations

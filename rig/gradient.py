@@ -1,4 +1,4 @@
-"""The gradient of vertex functions on a triangle mesh, weighted by area, and deformation gradients."""
+"""Area-weighted gradients of vertex functions on a mesh, and deformation gradients."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def gradient_operator(vertices: Floats, triangles: Ints32) -> sparse.csr_array:
 
 
 def deformation_gradients(rest: Floats, deformed: Floats, triangles: Ints32) -> Floats:
-    """Deformation gradient of each triangle: the 3x3 that carries rest edges and normal to deformed.
+    """Deformation gradient of each triangle: 3x3, carries rest edges and normal to deformed.
 
     Unit normals stand for the third direction. Where the deformed triangle has collapsed to a line
     (a shut eyelid) the rest normal is kept; where the rest triangle has no area the identity is.

@@ -79,7 +79,7 @@ def choose_neutral_frame(template: Template, points: Floats, confidence: Floats)
 
 
 def _placed_offsets(template: Template, points: Floats, confidence: Floats) -> Floats:
-    """Frames placed on the template, minus its neutral: (F, V, 3), mm; unseen vertices take their mean."""
+    """Placed frames minus the neutral: (F, V, 3), mm; unseen vertices take their mean."""
     offsets = np.empty(points.shape)
     known = confidence > 0
     for row, (frame, sure) in enumerate(zip(points, confidence, strict=True)):

@@ -11,6 +11,7 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
+from itertools import pairwise
 from typing import Any
 
 _WORTH_THREADS = 256  # items; fewer are done at once by the caller
@@ -29,10 +30,7 @@ def run_ranges(kernel: Callable[..., None], count: int, *arguments: Any) -> None
         kernel(0, count, *arguments)
         return
     edges = [count * part // workers for part in range(workers + 1)]
-    jobs = [
-        _pool(workers).submit(kernel, begin, end, *arguments)
-        for begin, end in zip(edges[:-1], edges[1:], strict=True)
-    ]
+    jobs = [_pool(workers).submit(kernel, begin, end, *arguments) for begin, end in pairwise(edges)]
     for job in jobs:
         job.result()
 

@@ -103,9 +103,9 @@ class Schedule:
         iterations: most turns.
         relative_change: of the total energy, below which it stops.
         mask_tolerance: of a shape's extent, below which the template holds a vertex still.
-        variation: how far the actor's shapes depart from the transferred ones, as a share of their own
-            displacement. With the residual for noise it sets `relative_mm2` of the shapes step,
-            anew at every turn.
+        variation: how far the actor's shapes depart from the transferred ones, as a share of their
+            own displacement. With the residual for noise it sets `relative_mm2` of the shapes
+            step, anew at every turn.
         weights: priors of the weights step.
         update: priors of the shapes step.
     """
@@ -193,7 +193,7 @@ def personalise(
 
 
 def _priors(schedule: Schedule, rms_mm: float) -> UpdatePriors:
-    """Shrinkage of Bayes: variance of the noise, per coordinate, over that of the shapes' departure."""
+    """Bayes' shrinkage: variance of the noise, per coordinate, over that of the departure."""
     noise_mm2 = max(rms_mm, _NOISE_FLOOR_MM) ** 2 / 3.0
     return replace(schedule.update, relative_mm2=noise_mm2 / schedule.variation**2)
 

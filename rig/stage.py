@@ -19,7 +19,14 @@ from capture.progress import Progress, silent
 from rig.face_rig import FaceRig, read_rig, write_rig
 from rig.neutral_frame import approximate_neutral, choose_neutral_frame
 from rig.report import describe_solve, write_report
-from rig.solve import Fit, Observations, Schedule, personalise
+from rig.solve import (
+    Fit,
+    Observations,
+    Schedule,
+    personalise,
+    pose_frames,
+    weighted_rms,
+)
 from rig.template import Template
 from rig.update import UpdatePriors
 from rig.weight_table import WeightTable
@@ -149,6 +156,7 @@ def solve_rig(
     first, fit, turns = personalise(solvable, neutral, seen, settings.schedule(), progress)
     report = describe_solve(template, moving, seen, (first, fit), turns)
     report |= {"neutral_frame": frame, "seconds": round(time.monotonic() - started, 3)}
+    report["best_fit"] = _best_fit(seen, first, fit)
     report["topology_matches"] = _same_topology(template, performances)
     rig = _whole_rig(template, moving, fit)
     write_report(Path(out) / "report.json", report)
@@ -230,6 +238,21 @@ def _neutral_frame(template: Template, seen: Observations, asked: int) -> int:
     if not (seen.confidence[asked] > 0).any():
         raise InputError(f"neutral_frame {asked}: no vertex of that frame has confidence above 0")
     return asked
+
+
+def _best_fit(seen: Observations, *fits: Fit) -> dict[str, float]:
+    """Residuals with no prior on the weights: what each set of shapes can reach at best."""
+    free = WeightPriors(sparsity_mm2=0.0, evidence=0.0, smoothness=0.0, debias=False)
+    reached = []
+    for fit in fits:
+        posed = pose_frames(fit.neutral, fit.deltas, seen, free, fit.weights)
+        reached.append(weighted_rms(posed.residuals(seen.points), seen.confidence))
+    before, after = reached
+    return {
+        "residual_transferred_mm": before,
+        "residual_refined_mm": after,
+        "ratio": after / before if before > 0 else 0.0,
+    }
 
 
 def _with_shapes(template: Template, kept: Bools) -> Template:

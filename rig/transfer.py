@@ -23,10 +23,10 @@ def transfer_shapes(
     For each shape, the displacements d minimise `|G (neutral + d) - F G neutral|^2`, with G the
     actor's area-weighted gradient operator and F the template's deformation gradients: one
     factorisation of `G.T @ G` serves every shape and coordinate. The gauge is fixed once per
-    connected component, at the vertices that the template's shape leaves alone (or, where it leaves
-    none, by the template's mean displacement). A shape that would still move those vertices is solved
-    again on its own, with every one of them held. Triangles spanned between paired lids and lips make
-    eyes and mouth shut on the actor when they shut on the template.
+    connected component, at the vertices that the template's shape leaves alone (or, where it
+    leaves none, by the template's mean displacement). A shape that would still move those
+    vertices is solved again on its own, with every one of them held. Triangles spanned between
+    paired lids and lips make eyes and mouth shut on the actor when they shut on the template.
 
     Args:
         template: the artist's rig.
@@ -133,7 +133,7 @@ def _solve_held(
 
 
 def _settle(delta: Floats, source: Floats, support: Bools, labels: Ints) -> tuple[Floats, float]:
-    """Fix each component's free translation and hold static vertices still; how far they were off."""
+    """Fix each component's translation, hold static vertices; also how far they were off, mm."""
     count = int(labels.max()) + 1
     has_still = np.bincount(labels[~support], minlength=count) > 0
     chosen = ~support | ~has_still[labels]

@@ -24,10 +24,10 @@ class UpdatePriors:
     """How far shapes may move from their targets.
 
     Attributes:
-        gradient_mm2: lambda_r, the strength of E_r = |G (D - D*)|^2. Gradients are integrated over the
-            mesh and divided by the mean area of a vertex, so the strength is in mm^2 and does not
-            depend on how finely the face is meshed: sqrt(gradient / offset) is the distance, in mm,
-            over which corrections are smoothed.
+        gradient_mm2: lambda_r, the strength of E_r = |G (D - D*)|^2. Gradients are integrated over
+            the mesh and divided by the mean area of a vertex, so the strength is in mm^2 and does
+            not depend on how finely the face is meshed: sqrt(gradient / offset) is the distance,
+            in mm, over which corrections are smoothed.
         offset: lambda_d, the strength of E_d = |D - D*|^2 (1: one sure observation at weight 1).
         relative_mm2: added to it at each vertex of each shape, divided by the squared displacement
             that the target has there: what hardly moves on the template hardly changes.
@@ -94,7 +94,7 @@ def update_shapes(
     priors: UpdatePriors,
     start: Floats | None = None,
 ) -> tuple[Floats, Floats]:
-    """Solve Ma et al. Eq 7 with the neutral column: new neutral and shapes, all coordinates at once.
+    """Solve Ma et al. Eq 7 with the neutral column: new neutral and shapes, x, y, z at once.
 
     Args:
         neutral: (V, 3) current neutral, mm.
@@ -166,8 +166,9 @@ def assemble(
     square = np.asarray(evidence.confidence, dtype=np.float64) ** 2
     blocks = np.empty(int(block_starts[-1]))
     right = np.empty((len(columns), 3))
-    run_ranges(_fill, len(counts), starts, columns, block_starts, square.T.copy(), factors,
-               np.ascontiguousarray(residual.transpose(1, 0, 2)), stiffness, blocks, right)  # fmt: skip
+    residual = np.ascontiguousarray(residual.transpose(1, 0, 2))
+    arrays = (starts, columns, block_starts, square.T.copy(), factors, residual, stiffness)
+    run_ranges(_fill, len(counts), *arrays, blocks, right)
     return UpdateSystem(starts, columns, position, block_starts, blocks, laplacian, right)
 
 

@@ -110,9 +110,9 @@ def solve_weights(
 ) -> tuple[Floats, Floats]:
     """Weights in [0, 1] and head motion of every frame: Ma et al. Eq 4.
 
-    Alternates the closed-form rotation (weights fixed) with an exact box QP over weights and a small
-    rotation together. Its fixed points are those of the paper's alternation, without that one's crawl
-    where a shape holds some rigid motion, as an opening jaw does.
+    Alternates the closed-form rotation (weights fixed) with an exact box QP over weights and a
+    small rotation together. Its fixed points are those of the paper's alternation, without that
+    one's crawl where a shape holds some rigid motion, as an opening jaw does.
 
     Args:
         sums: from `sum_frames`.

@@ -1,9 +1,9 @@
 """Benchmark of the rig solver: `python -m tools.bench.bench_rig [CASE_FOLDER ...]`.
 
 Prints one JSON line for the blendshape update against the literal sparse system of Ma et al. Eq 7
-(SciPy `spsolve` on three coordinates), one for weights and head motion against the literal loop over
-vertices, and one for each folder with template.npz and performance.npz: the whole stage. Seconds are
-of CPU time of the process, so that they hold on a loaded machine.
+(SciPy `spsolve` on three coordinates), one for weights and head motion against the literal loop
+over vertices, and one for each folder with template.npz and performance.npz: the whole stage.
+Seconds are of CPU time of the process, so that they hold on a loaded machine.
 """
 
 from __future__ import annotations

@@ -41,7 +41,7 @@ class NeutralSettings:
     """Settings of the neutral stage; pairs of first and last run geometrically over the steps.
 
     Attributes:
-        steps: of the non-rigid registration.
+        steps: how many solves of the non-rigid registration.
         bending_first_mm: stiffness length at first: shorter waves of a step are smoothed away.
         bending_last_mm: stiffness length at last.
         reach_first_mm: matches further than this are dropped, at first.

@@ -176,8 +176,8 @@ def match_pair(
         *levels[-1], (limits_px[0] / factor, limits_px[1] / factor), settings.seed_block
     )
     refined = _climb(levels, seed, settings)
-    mirrored = _right_view(levels, refined, settings)
-    return _judge(left, right, refined, mirrored, settings)
+    mirrored = _right_view(refined, settings)
+    return _judge(left, refined, mirrored, settings)
 
 
 def pyramid(left: Floats32, right: Floats32, size_px: int) -> list[tuple[Floats32, Floats32]]:
@@ -212,9 +212,7 @@ def _climb(
     return refined
 
 
-def _right_view(
-    levels: list[tuple[Floats32, Floats32]], refined: Refined, settings: DisparitySettings
-) -> Floats32:
+def _right_view(refined: Refined, settings: DisparitySettings) -> Floats32:
     """The disparity seen by the right view: the nearest surface landing on each pixel."""
     height, width = refined.disparity.shape
     rows, columns = np.nonzero((refined.ncc > settings.ncc_min) & np.isfinite(refined.disparity))
@@ -228,7 +226,6 @@ def _right_view(
 
 def _judge(
     left: Floats32,
-    right: Floats32,
     refined: Refined,
     mirrored: Floats32,
     settings: DisparitySettings,

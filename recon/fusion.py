@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -15,6 +16,16 @@ from recon.rectify import Rectification
 
 _FIT_RADIUS = 2  # px, window of the plane fitted for a normal
 _SIGMA_FLOOR_PX = 0.05  # no match is trusted beyond this
+_RANGES = (
+    ("agree_px", 0.01, 20.0),
+    ("agreeing", 0, 20),
+    ("facing_min", 0.0, 0.95),
+    ("lone_facing", 0.0, 1.0),
+    ("lone_sigma_px", 0.0, 10.0),
+    ("stride", 1, 16),
+    ("voxel_px", 0.1, 50.0),
+    ("passes", 1, 5),
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,11 +53,7 @@ class FusionSettings:
     passes: int = 1
 
     def __post_init__(self) -> None:
-        for name, low, high in (
-            ("agree_px", 0.01, 20.0), ("agreeing", 0, 20), ("facing_min", 0.0, 0.95),
-            ("voxel_px", 0.1, 50.0), ("stride", 1, 16), ("lone_facing", 0.0, 1.0), ("lone_sigma_px", 0.0, 10.0),
-            ("passes", 1, 5),
-        ):  # fmt: skip
+        for name, low, high in _RANGES:
             value = getattr(self, name)
             if not low <= value <= high:
                 raise SettingsError(f"{name}: expected {low}..{high}, found {value}")
@@ -159,8 +166,7 @@ def fuse(views: Sequence[DepthView], settings: FusionSettings, *, workers: int =
     return _thin(positions, normals, weights, support, spacing, agreement)
 
 
-@dataclass(frozen=True, eq=False)
-class _Packed:
+class _Packed(NamedTuple):
     """All depth views in flat arrays, for the compiled loops."""
 
     disparity: Floats32  # concatenated rows of all maps
@@ -215,10 +221,8 @@ def _confirmed(
     points, normals, sigma = points[good], normals[good], sigma[good]
     for _ in range(settings.passes):
         points, weights, support, seeing, against, spread = _consensus(
-            points, normals, sigma, own,
-            packed.disparity, packed.sigma, packed.layout, packed.frame, packed.centre, packed.lens,
-            np.float64(settings.agree_px),
-        )  # fmt: skip
+            points, normals, sigma, own, packed, settings.agree_px
+        )
     wanted = 1 + np.minimum(settings.agreeing, seeing)
     lone = (support > 1) | (
         (facing[good] > settings.lone_facing) & (sigma < settings.lone_sigma_px)
@@ -233,12 +237,7 @@ def _consensus(
     normals: Floats32,
     sigma: Floats32,
     own: int,
-    disparity: Floats32,
-    deviation: Floats32,
-    layout: Ints,
-    frame: Floats,
-    centre: Floats,
-    lens: Floats,
+    packed: _Packed,
     agree_px: float,
 ) -> tuple[Floats32, Floats32, Ints32, Ints32, Ints32, Floats32]:  # pragma: no cover - compiled
     """Move every point along its normal to the weighted mean of the pairs that agree with it.
@@ -247,6 +246,7 @@ def _consensus(
     there, pairs that see through the point, and the deviation of the agreeing pairs along the
     normal, mm.
     """
+    disparity, deviation, layout, frame, centre, lens = packed
     count = len(points)
     moved = np.empty((count, 3), np.float32)
     weights = np.empty(count, np.float32)
@@ -288,7 +288,7 @@ def _consensus(
                     continue
             reached = lens[q, 3] / (found - lens[q, 4])
             offset = along * (reached / z - 1.0)
-            error = np.sqrt(error * error + 0.0025) * z / lens[q, 3] * along
+            error = np.sqrt(error * error + _SIGMA_FLOOR_PX**2) * z / lens[q, 3] * along
             w = 1.0 / (error * error)
             agreeing += 1
             total += w * offset

@@ -20,8 +20,9 @@ from scipy import ndimage
 
 from capture.arrays import Bools, Floats32
 
-# A cubic through neighbours 1 and 2 steps away answers -5/3 to its shortest wave: undamped, that wave
-# would grow. Neighbours 2 and 4 away calm waves as long as the window, which matching cannot see.
+# A cubic through neighbours 1 and 2 steps away answers -5/3 to its shortest wave: undamped, that
+# wave would grow. Neighbours 2 and 4 away calm waves as long as the window, which matching cannot
+# see.
 _DAMPING = np.float32(0.8)
 _WAYS = ((0, 1), (1, 0), (0, 2), (2, 0))
 

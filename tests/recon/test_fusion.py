@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from capture.errors import SettingsError
-from recon.fusion import DepthView, FusionSettings, fuse, lift
+from recon.fusion import DepthView, FusionSettings, _consensus, _pack, fuse, lift
 from recon.rectify import rectification
 from tests.synthetic_stereo import RADII_MM, distance, hit, ring
 
@@ -69,6 +69,41 @@ def test_threads_do_not_change_a_byte():
     one, four = (fuse(made, FusionSettings(), workers=n) for n in (1, 4))
     assert one.positions.tobytes() == four.positions.tobytes()
     assert one.confidence.tobytes() == four.confidence.tobytes()
+
+
+def test_the_compiled_consensus_is_the_plain_weighted_mean():
+    made = views(noise_px=0.2)
+    points, normals, sigma = lift(made[1], 7)
+    good = np.isfinite(normals).all(axis=1)
+    points, normals, sigma = points[good], normals[good], sigma[good]
+    moved, _, support, *_ = _consensus(points, normals, sigma, 1, _pack(made), 0.7)
+    for n in range(0, len(points), 40):
+        total, weight, count = 0.0, 0.0, 0
+        for index, view in enumerate(made):
+            column, row, expected = view.geometry.project(points[n : n + 1].astype(np.float64))[0]
+            found = expected if index == 1 else _bilinear(view.disparity, column, row)
+            ray = points[n].astype(np.float64) - view.geometry.left.centre
+            if not abs(found - expected) <= 0.7 or normals[n] @ ray >= 0:
+                continue
+            reached = view.geometry.triangulate(np.array([[column, row, found]]))[0]
+            offset = normals[n] @ (reached - points[n])
+            depth = ray @ view.geometry.rotation[2]
+            mm = (normals[n] @ ray) * depth / (view.geometry.focal_px * view.geometry.baseline_mm)
+            trust = 1 / (mm**2 * (0.05**2 + 0.05**2))
+            total, weight, count = total + trust * offset, weight + trust, count + 1
+        assert support[n] == count
+        np.testing.assert_allclose(moved[n], points[n] + total / weight * normals[n], atol=1e-3)
+
+
+def _bilinear(plane: np.ndarray, column: float, row: float) -> float:
+    i, j = int(np.floor(row)), int(np.floor(column))
+    if i < 0 or j < 0 or i + 1 >= plane.shape[0] or j + 1 >= plane.shape[1]:
+        return np.nan
+    cut = plane[i : i + 2, j : j + 2].astype(np.float64)
+    if not np.ptp(cut) < 2.0:
+        return np.nan
+    s, t = row - i, column - j
+    return float(np.array([1 - s, s]) @ cut @ np.array([1 - t, t]))
 
 
 def test_a_setting_out_of_range_is_named():

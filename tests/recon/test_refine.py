@@ -115,7 +115,10 @@ def test_smoothing_keeps_curved_surfaces_and_agrees_with_a_plain_loop():
 def _plain_smooth(moved: np.ndarray, sigma: np.ndarray, i: int, j: int, smoothness: float) -> float:
     total, weight = 0.0, 0.0
     for n in (1, 2):
-        for line in (moved[i, j - 2 * n : j + 2 * n + 1 : n], moved[i - 2 * n : i + 2 * n + 1 : n, j]):
+        for line in (
+            moved[i, j - 2 * n : j + 2 * n + 1 : n],
+            moved[i - 2 * n : i + 2 * n + 1 : n, j],
+        ):
             far, near = (line[0] + line[4]) / 2, (line[1] + line[3]) / 2
             bend = abs(line[1] - line[2]) - abs(line[3] - line[2])
             total += np.exp(-(bend**2)) * (4 * near - far) / 3

@@ -11,7 +11,7 @@ from capture.pose import Pose
 from track.rigid import fit_similarity
 
 _ROUNDS = 12
-_FLOOR_MM = 0.02  # spread below which skin counts as rigid: the tracker's own noise
+_FLOOR_MM = 0.06  # spread below which skin counts as rigid: thrice the tracker's own noise
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -62,12 +62,12 @@ class TrackSettings:
     spacing_mm: float = 6.0
     search_mm: float = 7.0
     passes: int = 2
-    half_window_px: int = 7
-    half_window_coarse_px: int = 5
-    bending_coarse_mm: float = 8.0
+    half_window_px: int = 6
+    half_window_coarse_px: int = 4
+    bending_coarse_mm: float = 3.0
     bending_mm: float = 1.5
     min_cosine: float = 0.35
-    min_correlation: float = 0.5
+    min_correlation: float = 0.6
     search_stride: int = 3
     rotation_iterations: int = 2
     extrapolation: float = 0.7

@@ -1,0 +1,97 @@
+"""A textured, bumpy patch that bends and turns before a few cameras: the tracker's small truth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from capture.arrays import Floats, Floats32, Ints32
+from capture.camera import Camera, CameraArray
+from capture.camera_file import write_cameras
+from capture.pose import Pose
+from recon.mesh import Mesh
+from tests.synthetic import looking_at
+from track.raster import Rasterizer
+
+
+def patch_mesh(side: int = 18) -> Mesh:
+    """A quad grid over 90 x 90 mm with a nose and waves, facing +Z."""
+    y, x = np.mgrid[side:-1:-1, 0 : side + 1] * (90.0 / side) - 45.0
+    z = 12.0 * np.exp(-(x**2 + y**2) / 300.0) - 0.006 * (x**2 + y**2) + np.sin(x / 7.0)
+    corner = np.arange((side + 1) ** 2).reshape(side + 1, side + 1)
+    quads = np.stack([corner[1:, :-1], corner[1:, 1:], corner[:-1, 1:], corner[:-1, :-1]], -1)
+    return Mesh(np.stack([x, y, z], -1).reshape(-1, 3), quads.reshape(-1, 4).astype(np.int32))
+
+
+def patch_array(count: int = 4, size: int = 200) -> CameraArray:
+    """Cameras 300 mm away, spread over 60 degrees, at two heights."""
+    cameras = []
+    for c in range(count):
+        angle = np.radians(60.0) * (c / max(count - 1, 1) - 0.5)
+        centre = 300.0 * np.array([np.sin(angle), 0.15 * (-1) ** c, np.cos(angle)])
+        cameras.append(
+            Camera(
+                name=f"cam{c:02d}",
+                width=size,
+                height=size,
+                fx=2.6 * size,
+                fy=2.6 * size,
+                cx=size / 2 + 0.3,
+                cy=size / 2 - 0.7,
+                distortion=np.array([-0.12, 0.1, 1e-4, -2e-4, 0.0]),
+                camera_from_world=looking_at(centre, np.zeros(3)),
+            )
+        )
+    return CameraArray(tuple(cameras))
+
+
+def patch_motion(rest: Floats, amount: float) -> Floats:
+    """The patch bent, stretched and turned; `amount` 0 is rest."""
+    x, y = rest[:, 0], rest[:, 1]
+    bent = rest.copy()
+    bent[:, 2] += amount * 3.0 * np.exp(-((x - 15) ** 2 + (y + 10) ** 2) / 200.0)
+    bent[:, 0] += amount * 1.5 * np.exp(-((x + 15) ** 2 + y**2) / 250.0)
+    turn = Pose.from_rotation_vector(amount * np.array([0.04, 0.06, 0.02]), np.zeros(3))
+    return turn.apply(bent) + amount * np.array([1.5, -1.0, 2.0])
+
+
+def skin(points: Floats, seed: int = 3) -> Floats:
+    """A grey texture 0..1 of rest-space points (N, 3): waves of 3 to 12 mm in all directions."""
+    rng = np.random.default_rng(seed)
+    waves = rng.normal(0.0, 1.0, (60, 3))
+    waves *= (2 * np.pi / rng.uniform(3.0, 12.0, 60) / np.linalg.norm(waves, axis=1))[:, None]
+    total = np.cos(points @ waves.T + rng.uniform(0, 6.28, 60)).sum(axis=1)
+    grey: Floats = 0.5 + 0.3 * np.tanh(total / 6.0)
+    return grey
+
+
+def picture(camera: Camera, mesh: Mesh, vertices: Floats, gain: float = 1.0) -> Floats32:
+    """The patch with vertices (V, 3), textured at rest, on grey 0.2; float32 0..1."""
+    buffers = _raster(mesh.triangles, len(vertices)).render(camera, vertices)
+    image = np.full((camera.height, camera.width), 0.2)
+    y, x = np.nonzero(buffers.triangle >= 0)
+    corners = mesh.vertices[mesh.triangles[buffers.triangle[y, x]]]
+    weights = buffers.barycentric[y, x].astype(np.float64)
+    image[y, x] = skin(np.einsum("nk,nkx->nx", weights, corners))
+    return (gain * image).astype(np.float32)
+
+
+def write_patch_visit(folder: Path, amounts: list[float], seed: int = 0) -> tuple[Mesh, Floats]:
+    """A visiting take of the patch, with noise of 1.5 DN; returns the mesh and truth (F, V, 3)."""
+    rng = np.random.default_rng(seed)
+    mesh, cameras = patch_mesh(), patch_array()
+    truth = np.stack([patch_motion(mesh.vertices, amount) for amount in amounts])
+    write_cameras(folder / "cameras.json", cameras)
+    for camera in cameras:
+        (folder / camera.name).mkdir()
+        for f, vertices in enumerate(truth):
+            grey = 235.0 * picture(camera, mesh, vertices, gain=1.0 - 0.05 * (f % 2))
+            noisy = np.clip(np.rint(grey + rng.normal(0, 1.5, grey.shape)), 0, 255)
+            cv2.imwrite(str(folder / camera.name / f"{f:04d}.png"), noisy.astype(np.uint8))
+    return mesh, truth
+
+
+def _raster(triangles: Ints32, count: int) -> Rasterizer:
+    return Rasterizer(triangles, count)

@@ -1,0 +1,159 @@
+"""The tracking stage on a small synthetic take: truth, round trip, bytes, resuming, errors."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from capture.arrays import Floats
+from capture.errors import CameraError, SettingsError, TakeError
+from capture.take import Take
+from recon.mesh import Mesh
+from recon.visiting import import_take
+from tests.track.moving_patch import patch_mesh, write_patch_visit
+from track.performance import read_performance
+from track.stage import TrackSettings, track
+
+AMOUNTS = [0.0, 0.5, 1.0, 0.5, 0.0]
+
+
+@pytest.fixture(scope="module")
+def visit(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Mesh, Floats]:
+    folder = tmp_path_factory.mktemp("patch")
+    mesh, truth = write_patch_visit(folder, AMOUNTS)
+    return folder, mesh, truth
+
+
+def _take(visit: Path, out: Path) -> Take:
+    return import_take(visit, out)
+
+
+def _error(vertices: Floats, truth: Floats, side: int = 18) -> Floats:
+    """Distances (F, n) of the vertices two rings inside the border, mm."""
+    grid = np.arange((side + 1) ** 2).reshape(side + 1, side + 1)[2:-2, 2:-2].ravel()
+    return np.linalg.norm(vertices[:, grid] - truth[:, grid], axis=2)
+
+
+def test_truth_is_recovered_and_the_mesh_comes_home(
+    visit: tuple[Path, Mesh, Floats], tmp_path: Path
+) -> None:
+    folder, mesh, truth = visit
+    told: list[tuple[int, int]] = []
+    take = _take(folder, tmp_path / "take")
+    performance = track(
+        take, mesh, TrackSettings(), progress=lambda done, total, what: told.append((done, total))
+    )
+    error = _error(performance.vertices.astype(float), truth)
+    moved = np.linalg.norm(truth[2] - truth[0], axis=1)
+    assert moved.max() > 4.0  # mm
+    assert np.sqrt((error**2).mean()) < 0.06  # mm; a pixel is 0.58 mm
+    assert np.sqrt((error[-1] ** 2).mean()) < 0.04  # mm: the round trip
+    assert told == [(f + 1, 5) for f in range(5)]
+    assert performance.confidence.min() >= 0.0
+    assert performance.confidence.max() <= 1.0
+    assert (performance.reference == -1).all()
+    np.testing.assert_array_equal(performance.vertices[0], mesh.vertices.astype(np.float32))
+    report = json.loads((take.products / "track" / "report.json").read_text())
+    assert len(report["frames"]) == 5
+    assert report["frames"][2]["correlation"] > 0.9
+
+
+def test_same_bytes_twice_and_after_an_interruption(
+    visit: tuple[Path, Mesh, Floats], tmp_path: Path
+) -> None:
+    folder, mesh, _ = visit
+    whole, cut = _take(folder, tmp_path / "whole"), _take(folder, tmp_path / "cut")
+    track(whole, mesh, TrackSettings())
+
+    def stop(done: int, total: int, what: str) -> None:
+        if done == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        track(cut, mesh, TrackSettings(), progress=stop)
+    place = cut.products / "track"
+    assert not (place / "performance.npz").exists()
+    kept = place / "frames" / "frame_0001.npz"
+    stamp = kept.stat().st_mtime_ns
+    track(cut, mesh, TrackSettings())
+    assert kept.stat().st_mtime_ns == stamp  # used again, not made again
+    bytes_of_whole = (whole.products / "track" / "performance.npz").read_bytes()
+    assert (place / "performance.npz").read_bytes() == bytes_of_whole
+    assert not list(place.rglob(".partial*"))
+    stamp = (place / "performance.npz").stat().st_mtime_ns
+    again = track(cut, mesh, TrackSettings())
+    assert (place / "performance.npz").stat().st_mtime_ns == stamp  # current: skipped
+    stored = read_performance(place / "performance.npz")
+    np.testing.assert_array_equal(again.vertices, stored.vertices)
+
+
+def test_other_settings_do_not_use_old_frames(
+    visit: tuple[Path, Mesh, Floats], tmp_path: Path
+) -> None:
+    folder, mesh, truth = visit
+    take = _take(folder, tmp_path / "take")
+    first = track(take, mesh, TrackSettings(passes=1))
+    second = track(take, mesh, TrackSettings(passes=2))
+    assert (first.vertices != second.vertices).any()
+    assert np.median(_error(second.vertices.astype(float), truth)) < 0.06  # mm
+
+
+def test_a_neutral_that_no_view_sees_is_refused(
+    visit: tuple[Path, Mesh, Floats], tmp_path: Path
+) -> None:
+    folder, mesh, _ = visit
+    take = _take(folder, tmp_path / "take")
+    with pytest.raises(TakeError, match="no two views see the neutral at frame 0"):
+        track(take, mesh.with_vertices(mesh.vertices + [0.0, 500.0, 0.0]), TrackSettings())
+    assert not (take.products / "track" / "performance.npz").exists()
+
+
+def test_a_take_without_cameras_is_refused(
+    visit: tuple[Path, Mesh, Floats], tmp_path: Path
+) -> None:
+    folder, mesh, _ = visit
+    take = _take(folder, tmp_path / "take")
+    (take.folder / "cameras.json").unlink()
+    with pytest.raises(CameraError, match=r"no cameras\.json"):
+        track(take, mesh, TrackSettings())
+
+
+def test_landmarks_that_are_not_json_are_refused(
+    visit: tuple[Path, Mesh, Floats], tmp_path: Path
+) -> None:
+    folder, mesh, _ = visit
+    take = _take(folder, tmp_path / "take")
+    marks = tmp_path / "marks.json"
+    marks.write_text("{")
+    with pytest.raises(TakeError, match=r"marks\.json: expected landmarks as JSON"):
+        track(take, mesh, TrackSettings(), landmarks=marks)
+
+
+def test_settings_out_of_range_are_refused() -> None:
+    with pytest.raises(SettingsError, match=r"track\.passes = 0: must be at least 1"):
+        TrackSettings(passes=0)
+    with pytest.raises(SettingsError, match=r"track\.min_cosine"):
+        TrackSettings(min_cosine=float("nan"))
+
+
+@pytest.mark.slow
+@pytest.mark.shared_data
+def test_a_smile_is_followed(tmp_path: Path) -> None:
+    shared = Path(__file__).resolve().parents[2].parent / "shared" / "takes" / "dev-smile"
+    if not shared.is_dir():
+        pytest.skip("needs the shared folder beside the repository")
+    from recon.mesh import read_obj
+
+    take = import_take(shared, tmp_path / "take")
+    performance = track(take, read_obj(shared / "neutral.obj"), TrackSettings())
+    with np.load(shared / "truth.npz") as archive:
+        truth = archive["vertices"].astype(float)
+    error = np.linalg.norm(performance.vertices - truth, axis=2)
+    sure = performance.confidence > 0.2
+    assert np.sqrt((error[sure] ** 2).mean()) < 0.25  # mm
+    assert np.sqrt((error[-1][sure[-1]] ** 2).mean()) < 0.08  # mm
+
+
+def test_the_patch_faces_the_cameras() -> None:
+    assert (patch_mesh().normals()[:, 2] > 0).all()

@@ -17,7 +17,7 @@ HALF = 5
 def _two_sheets() -> Mesh:
     """The patch, and a strip in front of its upper half that is no part of it."""
     mesh = patch_mesh()
-    strip = mesh.vertices + [0.0, 40.0, 15.0]
+    strip = mesh.vertices + [0.0, 40.0, 30.0]
     polygons = np.concatenate([mesh.polygons, mesh.polygons + len(strip)]).astype(np.int32)
     return Mesh(np.concatenate([mesh.vertices, strip]), polygons)
 
@@ -56,7 +56,7 @@ def test_hidden_samples_are_not_visible() -> None:
     points = samples.points(mesh.vertices)[level.samples]
     behind = samples.corners[level.samples].max(axis=1) < count
     # well under the strip, which begins at y = -5 and is as wide as the patch
-    shadow = (points[behind][:, 1] > 8.0) & (np.abs(points[behind][:, 0]) < 30.0)
+    shadow = (points[behind][:, 1] > 12.0) & (np.abs(points[behind][:, 0]) < 30.0)
     assert behind.sum() > 100
     assert shadow.sum() == 0
 

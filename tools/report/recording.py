@@ -21,6 +21,7 @@ _FATES = {
     Fate.INCOMPLETE: "#e69f00",
     Fate.LOST: "#d55e00",
     Fate.MISSED_TRIGGER: "#7b3294",
+    Fate.QUARANTINED: "#cc79a7",
     Fate.MISSING: "#222831",
 }
 _LEVELS = {Colour.GREEN: "good", Colour.AMBER: "warn", Colour.RED: "bad"}

@@ -21,7 +21,7 @@ class Arguments(Options):
     """Options of `likeness report`."""
 
     take: tyro.conf.Positional[Path]
-    """The take."""
+    """The take, or a session: then the latest take of each slate."""
     rig: Path | None = None
     """The folder that `likeness rig` wrote."""
     out: Path

@@ -14,8 +14,9 @@ from typing import Annotated, Any
 import tyro
 
 from capture.progress import Progress
-from rig.stage import RigSettings, solve_rig
+from rig.stage import RigSettings, check_match, solve_rig
 from rig.template import read_template
+from rig.weight_table import read_weights
 from tools.verbs.options import Options
 from track.performance import read_performance
 
@@ -41,12 +42,13 @@ def run(arguments: Arguments, progress: Progress) -> dict[str, Any]:
     """Solve and report the residuals."""
     template = read_template(arguments.template)
     performances = [read_performance(path) for path in arguments.performance]
+    check_match(template, performances, names=[str(path) for path in arguments.performance])
     solve_rig(
         template,
         performances,
         arguments.settings,
         arguments.out,
-        weights=arguments.weights,
+        weights=None if arguments.weights is None else read_weights(arguments.weights),
         progress=progress,
     )
     report = json.loads((arguments.out / "report.json").read_text(encoding="utf-8"))

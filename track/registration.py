@@ -27,10 +27,12 @@ from track.observe import believable, merged, observe
 from track.pyramid import camera_at_level, image_pyramid
 from track.raster import Rasterizer
 from track.reference import ReferenceLevel, facing_normals, reference_level, visible_samples
+from track.rigid import fit_similarity
 from track.schedule import Step
 from track.surface_samples import SurfaceSamples, sample_surface, vertex_rings
 
 _PRIOR_MM = 1.0
+_SURE = 0.25  # confidence from which a vertex carries its neighbours into the next frame
 _SINGLE_VIEW = 0.02  # weight of a sample that one view alone sees: its depth is the estimate's
 _RINGS = 3  # edges within which two triangles count as one piece of surface
 
@@ -115,6 +117,31 @@ class Registrar:
     def vertex_views(self) -> Floats:
         """Confidence (V,) of the reference itself: 1 where two views see the skin, 0 where none."""
         return self._to_vertices(np.minimum(self._seen / 2.0, 1.0))
+
+    def carried(self, vertices: Floats, confidence: Floats) -> Floats:
+        """The mesh (V, 3) again from its confident vertices alone.
+
+        What was not seen follows what was, from the neutral's own shape: so a lip that slipped
+        behind the other one while it was hidden does not stay there, where nothing could see it.
+
+        Args:
+            vertices: (V, 3) world mm.
+            confidence: (V,) 0..1.
+        """
+        sure = np.flatnonzero(confidence > _SURE)
+        if len(sure) < 12:
+            return vertices
+        constraints = Constraints(
+            corners=np.repeat(sure[:, None], 3, axis=1),
+            barycentric=np.tile([1.0, 0.0, 0.0], (len(sure), 1)),
+            targets=vertices[sure],
+            weights=np.ones(len(sure)),
+        )
+        rigid = fit_similarity(self._neutral[sure], vertices[sure])
+        supple = min(self._deformers)
+        return self._deformers[supple].solve(
+            constraints, start=rigid.apply(self._neutral), data_weight=10.0, rotation_iterations=3
+        )
 
     def register(self, start: Floats, images: Mapping[str, Floats32]) -> FrameResult:
         """Find the mesh in a frame.

@@ -64,8 +64,8 @@ class TrackSettings:
     passes: int = 2
     half_window_px: int = 6
     half_window_coarse_px: int = 4
-    bending_coarse_mm: float = 3.0
-    bending_mm: float = 1.5
+    bending_coarse_mm: float = 4.0
+    bending_mm: float = 2.0
     min_cosine: float = 0.35
     min_correlation: float = 0.6
     search_stride: int = 3
@@ -231,7 +231,9 @@ class _Work:
         if len(images) < _MIN_VIEWS:
             result = FrameResult.lost(start)
         else:
-            result = self._made().register(start, images)
+            registrar = self._made()
+            sure = before[-1].confidence.astype(np.float64)
+            result = registrar.register(registrar.carried(start, sure), images)
         figures = {
             "samples": float(result.samples),
             "correlation": result.correlation,

@@ -90,11 +90,12 @@ def record_session(
     devices = simulated_array(true_array, scene, seed=settings.seed)
     recorded = {note.slate for note in session.takes()}
     for act in script.acts:
-        if act.slate not in recorded:
-            record_take(
-                session, _shot(act), devices, RecordSettings(rate_hz=settings.rate_hz),
-                progress=progress,
-            )  # fmt: skip
+        if act.slate in recorded:
+            continue
+        record_take(
+            session, _shot(act), devices, RecordSettings(rate_hz=settings.rate_hz),
+            progress=progress,
+        )  # fmt: skip
         if act.kind == "face":
             depths = (0,) if act.slate == NEUTRAL else ()
             write_truth(folder / "truth" / act.slate, scene, true_array, act_times(act), depths)

@@ -19,23 +19,38 @@ from recon.surface import closest_points
 from track.rigid import fit_similarity
 
 
-def world_from_truth(cameras: CameraArray, true_cameras: CameraArray) -> Pose:
-    """The rigid motion from the simulator's world to the calibrated one, from camera centres.
+def world_from_truth(cameras: CameraArray, true_cameras: CameraArray, near: Floats) -> Pose:
+    """The rigid motion from the simulator's world to the calibrated one, about the face.
+
+    Points about the face are projected by the true cameras and triangulated by the calibrated ones.
+    Camera centres would not do: an array fits its images with centres some tenths of a mm off.
 
     Args:
         cameras: the calibrated array.
         true_cameras: the simulated array; cameras are paired by name.
+        near: (N, 3) points to align by, true world mm.
 
     Raises:
-        CameraError: when fewer than three cameras are in both.
+        CameraError: when fewer than two cameras are in both.
     """
     names = [name for name in cameras.names if name in true_cameras.names]
-    if len(names) < 3:
-        raise CameraError(f"need three cameras in common to align worlds, found {len(names)}")
-    ours = np.array([cameras.by_name(name).centre for name in names])
-    true = np.array([true_cameras.by_name(name).centre for name in names])
-    fit = fit_similarity(true, ours)
+    if len(names) < 2:
+        raise CameraError(f"need two cameras in common to align worlds, found {len(names)}")
+    found = _meeting_points(
+        np.array([cameras.by_name(name).centre for name in names]),
+        np.stack([cameras.by_name(n).rays(true_cameras.by_name(n).project(near)) for n in names]),
+    )
+    fit = fit_similarity(near, found)
     return Pose(fit.rotation, fit.translation)
+
+
+def _meeting_points(centres: Floats, rays: Floats) -> Floats:
+    """Points (N, 3) nearest to all rays (C, N, 3) from centres (C, 3), in least squares."""
+    across = np.eye(3) - rays[..., :, None] * rays[..., None, :]
+    system = across.sum(axis=0)
+    right = (across @ centres[:, None, :, None]).sum(axis=0)
+    met: Floats = np.linalg.solve(system, right)[..., 0]
+    return met
 
 
 def scan_distances(scan_points: Floats, vertices: Floats, triangles: Ints32) -> Floats:

@@ -1,4 +1,4 @@
-"""What the simulated actor costs: `python -m tools.bench.actor_bench` prints one JSON line."""
+"""What the simulated actor costs: `python -m tools.bench.bench_actor` prints one JSON line."""
 
 from __future__ import annotations
 

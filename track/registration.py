@@ -80,6 +80,8 @@ class Registrar:
         cameras: of the views, by device name.
         images: the reference images, float32 mono, of the views that have one.
         options: see `track.stage.TrackSettings`.
+        heights_mm: (V,) how far the skin lies over the neutral, along its normals; None: on it.
+            What is matched is the skin, b + h n; what is solved for is the mesh, b.
     """
 
     def __init__(
@@ -89,8 +91,10 @@ class Registrar:
         cameras: Mapping[str, Camera],
         images: Mapping[str, Floats32],
         options: RegistrarOptions,
+        heights_mm: Floats | None = None,
     ) -> None:
         self._neutral, self._triangles = neutral, triangles
+        self._heights = heights_mm
         self._options = options
         self._samples = sample_surface(neutral, triangles, options.spacing_mm)
         self._raster = Rasterizer(triangles, len(neutral))
@@ -174,12 +178,13 @@ class Registrar:
         return self._result(vertices, lifted, weights, score)
 
     def _reference(self, camera: Camera, image: Floats32) -> list[ReferenceLevel]:
-        points = self._samples.points(self._neutral)
+        skin = self._skin(self._neutral)
+        points = self._samples.points(skin)
         lenses = [camera_at_level(camera, level) for level in range(self._levels)]
-        drawn = [self._raster.render(lens, self._neutral) for lens in lenses]
+        drawn = [self._raster.render(lens, skin) for lens in lenses]
         normals = facing_normals(self._neutral, self._triangles)
         chosen = visible_samples(
-            self._samples, self._neutral, normals, camera, drawn[0], self._options.min_cosine
+            self._samples, skin, normals, camera, drawn[0], self._options.min_cosine
         )
         surface = (self._triangles, self._samples.triangle[chosen], self._rings)
         fine, coarse = self._options.half_window, self._options.half_window_coarse
@@ -198,7 +203,16 @@ class Registrar:
         """A coarse depth map of the mesh, and how many finest pixels one of its pixels spans."""
         level = min(1, self._levels - 1)
         camera = self._views[name][level].camera
-        return self._raster.render(camera, vertices).depth, float(2**level)
+        return self._raster.render(camera, self._skin(vertices)).depth, float(2**level)
+
+    def _skin(self, vertices: Floats) -> Floats:
+        """The skin (V, 3) over a mesh: normal displacements ride on its own normals."""
+        if self._heights is None:
+            return vertices
+        lifted: Floats = vertices + self._heights[:, None] * facing_normals(
+            vertices, self._triangles
+        )
+        return lifted
 
     def _measure(
         self,
@@ -207,11 +221,12 @@ class Registrar:
         images: Mapping[str, Floats32],
         occluders: Mapping[str, tuple[Floats32, float]],
     ) -> tuple[Lifted, float]:
-        points = self._samples.points(vertices)
+        skin = self._skin(vertices)
+        points = self._samples.points(skin)
 
         def measure(name: str) -> tuple[Observations, Floats]:
             level = self._views[name][step.level]
-            view = guided_view(level, self._triangles, vertices, images[name], occluders.get(name))
+            view = guided_view(level, self._triangles, skin, images[name], occluders.get(name))
             matches = self._match(step, level, view)
             believed = believable(matches, self._options.min_correlation, step.limit_px)
             seen = observe(level, view, matches, points, believed)
@@ -238,7 +253,7 @@ class Registrar:
         if len(used) < 12:
             return vertices, weights
         chosen = self._samples.select(used.astype(np.int32))
-        targets = chosen.points(vertices) + lifted.motion[used]
+        targets = chosen.points(vertices) + lifted.motion[used]  # c = u - h n: Ma et al. 2.2
         constraints = Constraints(
             corners=chosen.corners,
             barycentric=chosen.barycentric,

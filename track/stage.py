@@ -23,20 +23,23 @@ from capture.archive import read_archive, write_archive
 from capture.arrays import Bools, Floats, Floats32
 from capture.camera import CameraArray
 from capture.errors import ShapeError, TakeError
-from capture.product import is_current, replacing, stage_record, write_record
+from capture.product import hash_file, is_current, replacing, stage_record, write_record
 from capture.progress import Progress, silent
 from capture.settings import check_range
 from capture.take import Take
 from recon.images import mono
 from recon.mesh import Mesh
+from recon.scan import load_scan
 from track.head_motion import damped_motion, head_motion
 from track.performance import Performance, read_performance, write_performance
 from track.pyramid import level_count
 from track.registration import FrameResult, Registrar, RegistrarOptions
 from track.schedule import schedule
+from track.skin import skin_heights
 
 _FIGURES = ("samples", "correlation", "residual_px", "views", "seconds")
 _MIN_VIEWS = 2
+_SKIN_LIMIT_MM = 1.0  # a scan farther from the neutral shows something else
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,6 +60,8 @@ class TrackSettings:
         search_stride: in the first round every how manieth sample is matched.
         rotation_iterations: updates of the local frames in each solve.
         extrapolation: share of the head's last motion expected again.
+        use_scan: match the skin of the first frame's scan, at its height over the neutral, where
+            `likeness recon` made one; which matters where the neutral is not quite on the skin.
     """
 
     spacing_mm: float = 6.0
@@ -71,6 +76,7 @@ class TrackSettings:
     search_stride: int = 3
     rotation_iterations: int = 2
     extrapolation: float = 0.7
+    use_scan: bool = True
 
     def __post_init__(self) -> None:
         ranges = {
@@ -272,8 +278,20 @@ class _Work:
                 {camera.name: camera for camera in self._cameras},
                 images,
                 _options(self._settings, self._cameras, self._neutral),
+                self._heights(),
             )
         return self._registrar
+
+    def _heights(self) -> Floats | None:
+        """How far the first frame's scan lies over the neutral, where there is such a scan."""
+        path = _scan_path(self._take)
+        if not self._settings.use_scan or not path.is_file():
+            return None
+        scan = load_scan(path)
+        mesh = self._neutral
+        return skin_heights(
+            mesh.vertices, mesh.triangles, (scan.vertices, scan.triangles), _SKIN_LIMIT_MM
+        )
 
     def _images(self, frame: int) -> dict[str, Floats32]:
         take = self._take
@@ -305,6 +323,10 @@ def _frames(take: Take) -> tuple[int, ...]:
     return take.frames
 
 
+def _scan_path(take: Take) -> Path:
+    return take.products / "recon" / f"frame_{take.frames[0]:04d}.ply"
+
+
 def _record(
     take: Take, neutral: Mesh, settings: TrackSettings, landmarks: Path | None
 ) -> dict[str, Any]:
@@ -317,6 +339,8 @@ def _record(
         except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
             raise TakeError(f"{landmarks}: expected landmarks as JSON: {error}") from error
         inputs["landmarks"] = hashlib.sha256(text.encode()).hexdigest()
+    if settings.use_scan and take.frames and _scan_path(take).is_file():
+        inputs["scan"] = hash_file(_scan_path(take))
     return stage_record("track", settings, inputs)
 
 

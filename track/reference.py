@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from capture.arrays import Bools, Floats, Floats32, Ints32, check_shape
+from capture.arrays import Floats, Floats32, Ints32, check_shape
 from capture.camera import Camera
 from recon.mesh import vertex_normals
 from track.raster import RasterBuffers
@@ -209,11 +209,3 @@ def _drop_strangers(
         known = 0 <= x < width and 0 <= y < height and ids[y, x] >= 0
         if not known or not _joined(ids[y, x], own[n], triangles, starts, others):
             windows[n] = 0
-
-
-def seen_by(views: list[ReferenceLevel], count: int) -> Bools:
-    """Which of `count` samples at least two views see."""
-    views_of = np.zeros(count, np.int64)
-    for view in views:
-        views_of[view.samples] += 1
-    return views_of >= 2

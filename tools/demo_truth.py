@@ -18,6 +18,7 @@ from tools.report import TakeErrors
 from tools.truth import SkinPoints, scan_distances, world_from_truth
 from track.performance import read_performance
 
+_BESIDE_MM = 0.05
 _FAR_MM = 2.0  # a neutral vertex farther off the true skin is not on it: mouth bag, neck's rim
 
 
@@ -63,5 +64,6 @@ def _track_errors(tracked: Floats, skin: Floats, triangles: Ints32) -> Floats:
     points = SkinPoints.attach(tracked[0], skin[0], triangles)
     truth = np.stack([points.at(vertices) for vertices in skin])
     errors: Floats = np.linalg.norm(tracked - truth, axis=2)
-    errors[:, np.abs(points.offset_mm) > _FAR_MM] = np.nan
+    beside = errors[0] > _BESIDE_MM  # the nearest skin is the region's rim: not on the face
+    errors[:, beside | (np.abs(points.offset_mm) > _FAR_MM)] = np.nan
     return errors

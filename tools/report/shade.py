@@ -19,6 +19,8 @@ _FAR = 12.0  # distance of the studio camera in mesh radii: nearly orthographic
 # directions to the lights in camera space (+X right, +Y down, +Z forward), and their strengths
 _LIGHTS = (((-0.55, -0.65, -0.6), 0.62), ((0.75, -0.1, -0.55), 0.30), ((0.2, 0.9, -0.2), 0.10))
 _AMBIENT = 0.16
+_TURNED = 0.2  # of a normal's depth component: beyond it the mesh is seen from its inside
+_INSIDE = 0.35  # how bright the inside is, as through an eye's opening to the back of the head
 _HALFWAY = np.array([-0.3, -0.36, -1.0])  # between the key light and the camera
 
 
@@ -54,7 +56,7 @@ class Studio:
         """The shaded mesh over a plate (H, W, 3) of that camera, or over white."""
         check_shape(mesh=(self.mesh.vertices, "V 3"), vertices=(vertices, "V 3"))
         fine = enlarged(camera, _OVERSAMPLE)
-        lit, seen = self._lit(vertices, fine, colours)
+        lit, seen = self._lit(vertices, fine, colours, hollow=plate is not None)
         canvas = np.full((fine.height, fine.width, 3), _BACKGROUND, np.float32)
         if plate is not None:
             size = (fine.width, fine.height)
@@ -81,8 +83,9 @@ class Studio:
         return seen
 
     def _lit(
-        self, vertices: Floats, camera: Camera, colours: Floats | None
+        self, vertices: Floats, camera: Camera, colours: Floats | None, hollow: bool
     ) -> tuple[Floats32, Bools]:
+        """The lit picture and where it is drawn; a hollow mesh is not drawn on its inside."""
         buffers = self._rasterizer.render(camera, vertices)
         seen: Bools = buffers.triangle >= 0
         corners = self.mesh.triangles[buffers.triangle[seen]]
@@ -94,6 +97,9 @@ class Studio:
         local = np.einsum("nk,nkc->nc", share, self._normals[corners])
         local = local @ camera.camera_from_world.rotation.T.astype(np.float32)
         local /= np.sqrt(np.maximum((local**2).sum(axis=1, keepdims=True), 1e-18))
+        if np.median(local[:, 2]) > 0.0:
+            local *= -1.0  # polygons wound the other way
+        inside = local[:, 2] > _TURNED
         local[local[:, 2] > 0] *= -1.0  # both sides are lit
         albedo = (
             _SKIN
@@ -108,8 +114,12 @@ class Studio:
         facing = np.maximum(local @ half, 0.0) ** 8
         shine = 0.10 * facing * facing * facing
         picture = np.zeros((camera.height, camera.width, 3), np.float32)
-        picture[seen] = np.clip((albedo * light[:, None] + shine[:, None]) ** (1 / 1.35), 0.0, 1.0)
-        return picture, seen
+        shade = (albedo * light[:, None] + shine[:, None]) ** (1 / 1.35)
+        shade[inside] *= _INSIDE
+        picture[seen] = np.clip(shade, 0.0, 1.0)
+        outside = seen.copy()
+        outside[seen] = ~inside
+        return picture, outside if hollow else seen
 
 
 def studio_camera(vertices: Floats, yaw: float, size: int, pitch: float = 0.0) -> Camera:

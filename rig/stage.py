@@ -58,7 +58,7 @@ class RigSettings:
 
     iterations: int = 5
     relative_change: float = 0.01
-    sparsity_mm2: float = 0.03
+    sparsity_mm2: float = 0.01
     smoothness: float = 0.002
     evidence: float = 0.2
     debias: bool = True

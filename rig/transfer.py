@@ -12,6 +12,7 @@ from rig.template import Template
 
 MASK_TOLERANCE = 1e-3  # of a shape's own extent: below it a vertex counts as static
 _LEAK_MM = 0.03  # motion of static vertices above which a shape is solved with them held
+_SHUT_MM = 0.3  # lids or lips of the template nearer than this at rest are shut
 _BRIDGE_STRENGTH = 10.0  # of virtual triangles against skin: closing matters more than stretch
 
 
@@ -72,7 +73,8 @@ def virtual_triangles(template: Template) -> Ints32:
     """Triangles across the slit between paired lids and lips: (n, 3), two a step along the loop.
 
     A pair is joined to the next when both its ends are the neighbours (or the same vertices) of the
-    next one's, so that one array may hold both eyes.
+    next one's, so that one array may hold both eyes. Slits that are shut at rest, as lips mostly are,
+    get none: a triangle without area has no gradient to carry, and would glue the lips together.
     """
     polygons = template.polygons
     following = np.where(polygons[:, 3:] < 0, polygons[:, [1, 2, 0, 0]], polygons[:, [1, 2, 3, 0]])
@@ -85,7 +87,8 @@ def virtual_triangles(template: Template) -> Ints32:
     for pairs in (template.lid_pairs, template.lip_pairs):
         for (a, b), (c, d) in zip(pairs[:-1].tolist(), pairs[1:].tolist(), strict=True):
             joined = all(p == q or frozenset((p, q)) in edges for p, q in ((a, c), (b, d)))
-            if joined:
+            apart = template.neutral[[a, c]] - template.neutral[[b, d]]
+            if joined and np.linalg.norm(apart, axis=1).max() > _SHUT_MM:
                 found += [t for t in ((a, b, d), (a, d, c)) if len(set(t)) == 3]
     return np.array(found, dtype=np.int32).reshape(-1, 3)
 

@@ -93,6 +93,20 @@ def test_virtual_triangles_shut_a_wider_eye() -> None:
     assert gap(transfer_shapes(template, actor)) < 0.5
 
 
+def test_lips_that_touch_at_rest_part_as_far_as_the_templates() -> None:
+    shut = _slit(0.0)
+    opening = np.zeros((1, 66, 3))
+    opening[0, 33:, 1] = -9.0
+    template = Template(
+        neutral=shut.neutral, deltas=opening, names=("jawOpen",), polygons=shut.polygons,
+        lip_pairs=shut.lid_pairs,
+    )  # fmt: skip
+    actor = shut.neutral + np.outer(np.arange(66) >= 33, [0.0, -0.1, 0.0])  # nearly touching
+    deltas = transfer_shapes(template, actor)
+    assert len(virtual_triangles(template)) == 0
+    assert np.abs(deltas[0] - opening[0]).max() < 1e-6
+
+
 def test_pairs_that_are_not_neighbours_are_not_joined() -> None:
     template = _slit(8.0)
     broken = Template(

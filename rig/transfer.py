@@ -73,8 +73,8 @@ def virtual_triangles(template: Template) -> Ints32:
     """Triangles across the slit between paired lids and lips: (n, 3), two a step along the loop.
 
     A pair is joined to the next when both its ends are the neighbours (or the same vertices) of the
-    next one's, so that one array may hold both eyes. Slits that are shut at rest, as lips mostly are,
-    get none: a triangle without area has no gradient to carry, and would glue the lips together.
+    next one's, so that one array may hold both eyes. Slits that are shut at rest, as lips mostly
+    are, get none: a triangle without area has no gradient to carry, and would glue the lips.
     """
     polygons = template.polygons
     following = np.where(polygons[:, 3:] < 0, polygons[:, [1, 2, 0, 0]], polygons[:, [1, 2, 3, 0]])

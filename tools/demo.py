@@ -29,6 +29,7 @@ from rig.stage import RigSettings, solve_rig
 from rig.template import Template, read_template, write_template
 from tools.actor.model import build_actor
 from tools.actor.scene import DEMO_BOARD
+from tools.demo_picture import write_picture
 from tools.demo_session import (
     BOARD,
     EXPRESSIONS,
@@ -67,7 +68,7 @@ def run_demo(out: Path, settings: DemoSettings, *, progress: Progress = silent) 
     """Run the whole house once; what is finished is kept and skipped when run again.
 
     Args:
-        out: the folder to fill: session/, cameras.json, rig/, exports/, report.html.
+        out: the folder to fill: session/, cameras.json, rig/, exports/, report.html, picture.jpg.
         settings: of the demo; stages run with their own defaults.
         progress: told of every stage's steps.
 
@@ -104,7 +105,7 @@ def run_demo(out: Path, settings: DemoSettings, *, progress: Progress = silent) 
             track(take, neutral, TrackSettings(), progress=progress) for take in expressions
         ]
     with watch.timing("rig"):
-        solve_rig(template, performances, RigSettings(), out / "rig", progress=progress)
+        rig = solve_rig(template, performances, RigSettings(), out / "rig", progress=progress)
     with watch.timing("export"):
         _export(out, expressions, settings.rate_hz, progress)
     with watch.timing("report"):
@@ -121,6 +122,8 @@ def run_demo(out: Path, settings: DemoSettings, *, progress: Progress = silent) 
             timings=watch.seconds,
         )
         write_report(inputs, out / "report.html", progress=progress)
+        shown = [(take, peak_frame(take)) for take in expressions]
+        write_picture(out / "picture.jpg", shown, rig, cameras.names[len(cameras) // 2])
     seconds = {stage: round(spent, 1) for stage, spent in watch.seconds.items()}
     return {
         "report": str(out / "report.html"),

@@ -1,5 +1,6 @@
 # Every target does the set-up it needs first: system libraries, .venv, pinned requirements, ourselves.
 PYTHON := .venv/bin/python
+SHARED ?= ../shared
 .DEFAULT_GOAL := help
 .PHONY: help setup demo test test-slow test-landmarks check bench clean
 
@@ -25,8 +26,15 @@ test-landmarks: setup ## the 68-point detector on the simulated actor; read docs
 	@$(PYTHON) -m pip install --quiet --disable-pip-version-check "face_recognition_models==0.3.0"
 	@$(PYTHON) -m pytest -m "landmarks"
 
-bench: setup ## every benchmark, each with its opponent in the same run
-	@for script in tools/bench/bench_*.py; do echo "== $$script"; $(PYTHON) -m tools.bench.$$(basename $$script .py) || exit 1; done
+bench: setup ## every benchmark; those on real takes want the folder SHARED
+	$(PYTHON) -m tools.bench.bench_actor
+	$(PYTHON) -m tools.bench.bench_calibrate --seeds 1
+	$(PYTHON) -m tools.bench.bench_mcap
+	$(PYTHON) -m tools.bench.bench_rig
+	$(PYTHON) -m tools.bench.bench_neutral
+	$(PYTHON) -m tools.bench.bench_stereo $(SHARED)/takes/dev-smile 0 --score $(SHARED)/tools/score_scan.py
+	$(PYTHON) -m tools.bench.bench_track $(SHARED)/takes/dev-smile --truth $(SHARED)/takes/dev-smile/truth.npz
+	$(PYTHON) -m tools.bench.bench_spine $(SHARED)/takes/dev-smile --shared $(SHARED)
 
 clean: ## remove the environment and what the demo wrote
 	rm -rf .venv demo build *.egg-info

@@ -22,7 +22,7 @@ def test_a_session_goes_through_every_stage(tmp_path: Path) -> None:
     told: set[str] = set()
     report = run_demo(tmp_path, SMALL, progress=lambda done, total, what: told.add(what))
     assert report["scan_median_mm"] < 0.15
-    assert report["track_median_mm"] < 0.10
+    assert report["track_median_mm"] < 0.2
     assert report["track_rmse_mm"] < 0.60
     solved = json.loads((tmp_path / "rig" / "report.json").read_text(encoding="utf-8"))
     assert solved["ratio"] < 0.5

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from capture.arrays import Ints
 from capture.errors import ShapeError
 from capture.product import replacing
 
@@ -21,30 +22,44 @@ _DAMAGE = (
     ValueError, OSError, EOFError, RuntimeError, MemoryError, OverflowError,
     zipfile.BadZipFile, zlib.error, struct.error,
 )  # fmt: skip
+_LARGEST_BYTES = 16 << 30  # of one array: a few kilobytes of zip can claim any size
+_TEXT = "names"  # the one key of any archive of ours that holds text
+_NPY_MARK = b"\x93NUMPY"
 _EPOCH = (1980, 1, 1, 0, 0, 0)  # zip entries carry a time: a fixed one keeps bytes equal
 
 
 def read_archive(
-    path: Path, required: Sequence[str], optional: Sequence[str] = ()
+    path: Path,
+    required: Sequence[str],
+    optional: Sequence[str] = (),
+    *,
+    largest_bytes: int = _LARGEST_BYTES,
 ) -> dict[str, NDArray[Any]]:
     """Read the named arrays of an `.npz`; other arrays in it are left alone.
+
+    Only `names` may hold text; all others hold real numbers.
 
     Args:
         path: the file.
         required: keys that must be there.
         optional: keys that are read when they are there.
+        largest_bytes: an array that claims more is refused before memory is asked for it.
 
     Raises:
-        ShapeError: naming the file and the key that is missing, pickled or damaged.
+        ShapeError: naming the file and the key that is missing, pickled, damaged or too large.
     """
     path = Path(path)
     try:
         # Opened here and not by numpy, which leaves a damaged file open.
         with path.open("rb") as file:
-            archive = np.load(file, allow_pickle=False)
-            if not isinstance(archive, np.lib.npyio.NpzFile):
+            if (mark := file.read(6)) == _NPY_MARK:
                 raise ShapeError(f"{path}: expected an .npz archive, found a single .npy array")
+            if not mark.startswith(b"PK"):
+                raise ShapeError(f"{path}: expected an .npz archive, found other first bytes")
+            file.seek(0)
+            archive: Any = np.load(file, allow_pickle=False)
             with archive:
+                _check_sizes(archive, path, [*required, *optional], largest_bytes)
                 out = _read_keys(archive, path, required, optional)
     except FileNotFoundError as error:
         raise ShapeError(f"{path}: no such file") from error
@@ -57,8 +72,17 @@ def read_archive(
     return out
 
 
+def _check_sizes(archive: Any, path: Path, keys: Sequence[str], largest_bytes: int) -> None:
+    for entry in archive.zip.infolist():
+        key = entry.filename.removesuffix(".npy")
+        if key in keys and entry.file_size > largest_bytes:
+            raise ShapeError(
+                f"{path}: {key} claims {entry.file_size} bytes; at most {largest_bytes} are read"
+            )
+
+
 def _read_keys(
-    archive: np.lib.npyio.NpzFile, path: Path, required: Sequence[str], optional: Sequence[str]
+    archive: Any, path: Path, required: Sequence[str], optional: Sequence[str]
 ) -> dict[str, NDArray[Any]]:
     missing = [key for key in required if key not in archive.files]
     if missing:
@@ -74,8 +98,25 @@ def _read_keys(
             raise ShapeError(f"{path}: {key} cannot be read: {error}") from error
         if not isinstance(array, np.ndarray):
             raise ShapeError(f"{path}: {key} cannot be read: it is not an array")
+        if array.dtype.kind not in ("U" if key == _TEXT else "iufb"):
+            wanted = "text" if key == _TEXT else "real numbers"
+            raise ShapeError(f"{path}: {key} must hold {wanted}, found {array.dtype}")
         out[key] = array
     return out
+
+
+def whole_numbers(array: NDArray[Any], key: str) -> Ints:
+    """Indices as int64, from an array of integers, or of floats that are integers.
+
+    Raises:
+        ShapeError: naming the key, when a number is not whole or beyond 2^31.
+    """
+    if array.size and not (np.abs(array) < 2.0**31).all():
+        raise ShapeError(f"{key}: whole numbers below 2^31 are expected, found larger")
+    whole = array.astype(np.int64)
+    if not np.array_equal(whole, array):
+        raise ShapeError(f"{key}: whole numbers are expected, found fractions")
+    return whole
 
 
 def write_archive(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:

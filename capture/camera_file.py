@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from capture.camera import Camera, CameraArray
+from capture.documents import read_json
 from capture.errors import CameraError, LikenessError, raise_all
 from capture.names import is_plain_name
 from capture.pose import Pose
@@ -26,6 +27,7 @@ from capture.product import replacing
 
 _REQUIRED = ("name", "width", "height", "K", "dist", "R", "t")
 _OPTIONAL = ("gain",)  # a device's relative gain: a remark that no stage needs
+_SHOWN = 200  # characters of a wrong value that a message repeats
 _TOP = ("units", "cameras", "convention", "report")
 
 
@@ -35,12 +37,8 @@ def read_cameras(path: Path) -> CameraArray:
     Raises:
         CameraError: naming the file and every camera that does not fit.
     """
-    try:
-        document = json.loads(Path(path).read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise CameraError(f"{path}: no such file; `likeness calibrate` writes one") from error
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise CameraError(f"{path}: not readable as JSON: {error}") from error
+    absent = "no such file; `likeness calibrate` writes one"
+    document = read_json(path, CameraError, absent=absent)
     return cameras_from_document(document, str(path))
 
 
@@ -144,9 +142,14 @@ def _numbers(
     entry: Mapping[str, Any], key: str, shape: tuple[int, ...], label: str
 ) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
     try:
-        array = np.array(entry[key], dtype=np.float64)
+        found = np.array(entry[key])
+        if found.dtype.kind not in "iuf":  # text, null, true, or an integer of 20 digits
+            raise TypeError(f"numbers cannot be made of {found.dtype}")
     except (TypeError, ValueError) as error:
-        raise CameraError(f"{label}: {key} must hold numbers, found {entry[key]!r}") from error
+        shown = repr(entry[key])
+        shown = shown if len(shown) <= _SHOWN else f"{shown[:_SHOWN]} ..."
+        raise CameraError(f"{label}: {key} must hold numbers, found {shown}") from error
+    array = found.astype(np.float64)
     if array.shape != shape:
         raise CameraError(f"{label}: {key} must have shape {shape}, found {array.shape}")
     if not np.isfinite(array).all():

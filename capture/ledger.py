@@ -102,8 +102,13 @@ class Ledger:
     remarks: tuple[Remark, ...] = ()
 
     def __post_init__(self) -> None:
-        expected = [(k, device) for k in range(self.triggers) for device in self.devices]
-        if [(entry.trigger_index, entry.device) for entry in self.entries] != expected:
+        # Counted first: a damaged file may claim more triggers than memory can list.
+        whole = len(self.entries) == self.triggers * len(self.devices)
+        expected = ((k, device) for k in range(self.triggers) for device in self.devices)
+        if not whole or any(
+            (entry.trigger_index, entry.device) != pair
+            for entry, pair in zip(self.entries, expected, strict=True)
+        ):
             raise TakeError(
                 f"ledger: expected exactly one verdict for each of {self.triggers} triggers x "
                 f"{len(self.devices)} devices in order, found {len(self.entries)} entries"
@@ -159,10 +164,9 @@ def read_ledger(path: Path) -> Ledger:
     entries: list[LedgerEntry] = []
     remarks: list[Remark] = []
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
+        rows = list(csv.reader(path.read_text(encoding="utf-8").splitlines()))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise TakeError(f"{path}: not readable: {error}") from error
-    rows = list(csv.reader(lines))
     if not rows or tuple(rows[0]) != _COLUMNS:
         raise TakeError(f"{path}: expected a ledger with columns {', '.join(_COLUMNS)}")
     for number, row in enumerate(rows[1:], start=2):

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from capture.documents import read_json
 from capture.errors import LikenessError, TakeError, raise_all
 from capture.frame_header import ImageLayout
 from capture.names import is_plain_name
@@ -16,6 +17,7 @@ from capture.product import replacing
 FORMAT = "likeness-take"
 VERSION = 1
 _KINDS = ("import", "capture")
+_MOST_FRAMES = 10_000_000  # 28 hours at 100 frames/s
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,8 +65,10 @@ class TakeManifest:
             problems.append(f"kind must be one of {', '.join(_KINDS)}, found {self.kind!r}")
         if not self.devices:
             problems.append("a take needs at least one device")
-        if self.frame_count < 1:
-            problems.append(f"a take needs at least one frame, found {self.frame_count}")
+        if not 1 <= self.frame_count <= _MOST_FRAMES:
+            problems.append(
+                f"a take needs 1 to {_MOST_FRAMES} frames, found frame_count {self.frame_count}"
+            )
         names = [device.name for device in self.devices]
         problems += [
             f"device name must be letters, digits, '-', '_' or '.', found {name!r}"
@@ -85,10 +89,7 @@ def read_manifest(path: Path) -> TakeManifest:
     Raises:
         TakeError: naming the file, when it is damaged or was written by a newer version.
     """
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise TakeError(f"{path}: damaged manifest, not readable as JSON: {error}") from error
+    document = read_json(path, TakeError)
     if not isinstance(document, dict) or document.get("format") != FORMAT:
         raise TakeError(f'{path}: damaged manifest: expected "format": "{FORMAT}"')
     version = document.get("version")

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from capture.devices.protocol import DeviceArray
+from capture.documents import read_json
 from capture.errors import SettingsError, TakeError, raise_all
 from capture.judgement import Judgement, judge
 from capture.ledger import write_ledger
@@ -144,10 +145,7 @@ class Session:
         path = Path(folder) / "session.json"
         if not path.is_file():
             raise TakeError(f"{folder}: expected a session, found no session.json")
-        try:
-            document = json.loads(path.read_text(encoding="utf-8"))
-        except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-            raise TakeError(f"{path}: not readable as JSON: {error}") from error
+        document = read_json(path, TakeError)
         if not isinstance(document, dict) or document.get("format") != FORMAT:
             raise TakeError(f'{path}: expected "format": "{FORMAT}"')
         version = document.get("version")

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-import tomllib
 import types
 import typing
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from capture.documents import read_toml
 from capture.errors import SettingsError, raise_all
 
 
@@ -27,12 +27,7 @@ def read_settings(path: Path, stages: Mapping[str, type[Any]]) -> dict[str, Any]
     Raises:
         SettingsError: naming the file, the key, what was found and the nearest known key.
     """
-    try:
-        document = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise SettingsError(f"{path}: no such settings file") from error
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise SettingsError(f"{path}: not readable as TOML: {error}") from error
+    document = read_toml(path, SettingsError, absent="no such settings file")
     problems = [_unknown(key, stages, f"table [{key}]") for key in document if key not in stages]
     made: dict[str, Any] = {}
     for stage, kind in stages.items():

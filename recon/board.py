@@ -21,7 +21,6 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import math
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,6 +30,7 @@ import cv2
 import numpy as np
 
 from capture.arrays import Floats
+from capture.documents import read_toml
 from capture.errors import SettingsError, raise_all
 
 _LEAST_SQUARES = 3
@@ -132,15 +132,11 @@ def read_board(path: Path) -> Board:
     Raises:
         SettingsError: naming the file and every key that is missing, unknown or out of range.
     """
-    try:
-        document = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise SettingsError(
-            f"{path}: no such file; a board file holds a table [board] with kind, squares_x, "
-            "squares_y, square_mm, marker_mm, dictionary"
-        ) from error
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise SettingsError(f"{path}: not readable as TOML: {error}") from error
+    absent = (
+        "no such file; a board file holds a table [board] with kind, squares_x, "
+        "squares_y, square_mm, marker_mm, dictionary"
+    )
+    document = read_toml(path, SettingsError, absent=absent)
     raise_all(str(path), _unknown(document, ("board",), "table"), SettingsError)
     table = document.get("board")
     if not isinstance(table, Mapping):

@@ -34,6 +34,8 @@ def read_thing(path: Path) -> Thing:
     found = read_archive(path, required=(), optional=keys)
     if all(key in found for key in _PERFORMANCE):
         performance = read_performance(path)
+        if len(performance.frames) == 0:
+            raise InputError(f"{path}: a performance of no frames: there is nothing to export")
         _check_polygons(path, performance.polygons, performance.vertices.shape[1])
         return performance
     if all(key in found for key in _TEMPLATE):

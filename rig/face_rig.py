@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from capture.archive import read_archive, write_archive
+from capture.archive import read_archive, whole_numbers, write_archive
 from capture.arrays import Floats, Ints32, check_finite, check_shape
 from capture.errors import InputError, ShapeError, raise_all
 from rig.template import duplicate_names, text_names
@@ -86,7 +86,7 @@ def read_rig(path: Path) -> FaceRig:
             neutral=arrays["neutral"].astype(np.float64),
             deltas=arrays["deltas"].astype(np.float64),
             names=text_names(arrays["names"]),
-            polygons=arrays["polygons"].astype(np.int32),
+            polygons=whole_numbers(arrays["polygons"], "polygons").astype(np.int32),
             weights=arrays["weights"].astype(np.float64),
             head_from_rig=arrays["head_from_rig"].astype(np.float64),
         )

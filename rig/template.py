@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from capture.archive import read_archive, write_archive
+from capture.archive import read_archive, whole_numbers, write_archive
 from capture.arrays import Bools, Floats, Ints, Ints32, check_finite, check_shape
 from capture.errors import InputError, ShapeError, raise_all
 from recon.mesh import Mesh
@@ -114,7 +114,7 @@ def read_template(path: Path) -> Template:
             deltas=arrays["deltas"].astype(np.float64),
             names=text_names(arrays["names"]),
             polygons=_padded(arrays["polygons"]),
-            **{key: arrays[key].astype(np.int64) for key in arrays if key not in _REQUIRED},
+            **{key: whole_numbers(arrays[key], key) for key in arrays if key not in _REQUIRED},
         )
         _check_units(template.neutral)
     except InputError as error:
@@ -152,7 +152,7 @@ def text_names(names: NDArray[Any]) -> tuple[str, ...]:
 def _padded(polygons: NDArray[Any]) -> Ints32:
     if polygons.ndim == 2 and polygons.shape[1] == 3:
         polygons = np.concatenate([polygons, np.full((len(polygons), 1), -1)], axis=1)
-    return np.ascontiguousarray(polygons, dtype=np.int32)
+    return np.ascontiguousarray(whole_numbers(polygons, "polygons"), dtype=np.int32)
 
 
 def _index_problems(template: Template) -> list[str]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import struct
 import time
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from capture.archive import read_archive, write_archive
+from capture.archive import read_archive, whole_numbers, write_archive
 from capture.errors import ShapeError
 from tests.capture.refusals import refusal
 
@@ -70,3 +72,33 @@ def test_damaged_bytes_are_refused_and_never_crash(
     path.write_bytes(bytes(whole))
     said = refusal(lambda: read_archive(path, ["a", "names"]))  # damage to unread bytes may pass
     assert not said or "one.npz" in said
+
+
+def test_text_complex_numbers_and_fractions_are_refused_where_numbers_are_due(
+    tmp_path: Path,
+) -> None:
+    np.savez(tmp_path / "odd.npz", a=np.array(["1.5"]), b=np.array([1j]), names=np.array([1]))
+    for key, words in (("a", "real numbers"), ("b", "real numbers"), ("names", "text")):
+        with pytest.raises(ShapeError, match=f"odd.npz: {key} must hold {words}"):
+            read_archive(tmp_path / "odd.npz", [key])
+    assert whole_numbers(np.array([1.0, -1.0]), "polygons").tolist() == [1, -1]
+    for wrong in ([0.5], [2.0**40], [np.nan]):
+        with pytest.raises(ShapeError, match="polygons: whole numbers"):
+            whole_numbers(np.array(wrong), "polygons")
+
+
+def test_an_array_that_claims_more_than_is_read_is_refused_before_it_is_made(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "bomb.npz"
+    write_archive(path, {"a": np.zeros(8)})
+    data = path.read_bytes()
+    with zipfile.ZipFile(path) as archive:
+        entry = archive.getinfo("a.npy")
+    place = data.rindex(b"PK\x01\x02")  # its line in the central directory
+    claimed = struct.pack("<I", entry.file_size)
+    at = data.index(claimed, place + 24)
+    assert at == place + 24
+    path.write_bytes(data[:at] + struct.pack("<I", 0xFFFFFFFE) + data[at + 4 :])
+    with pytest.raises(ShapeError, match=r"bomb\.npz: a claims 4294967294 bytes"):
+        read_archive(path, ["a"], largest_bytes=1 << 30)

@@ -130,3 +130,16 @@ def test_any_json_is_read_or_refused_but_never_crashes(tree: Any, place: str) ->
         entry[place] = tree
     said = refusal(lambda: cameras_from_document(whole, "x"))
     assert not said or said.startswith("x")
+
+
+@pytest.mark.parametrize("wrong", [10**400, "400", None, True])
+def test_what_is_no_number_is_refused_by_camera_and_key(tmp_path: Path, wrong: object) -> None:
+    write_cameras(tmp_path / "cameras.json", small_array(2))
+    document = json.loads((tmp_path / "cameras.json").read_text())
+    document["cameras"][1]["K"] = [[wrong, 0, 1], [0, wrong, 1], [0, 0, 1]]
+    if wrong is True:
+        document["cameras"][1]["K"] = [[True] * 3] * 3
+    (tmp_path / "cameras.json").write_text(json.dumps(document))
+    with pytest.raises(CameraError, match="cam01: K must hold numbers") as refused:
+        read_cameras(tmp_path / "cameras.json")
+    assert len(str(refused.value)) < 500

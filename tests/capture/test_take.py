@@ -151,7 +151,7 @@ def put(key: str, value: Any) -> Callable[[Any], None]:
         (put("devices", []), "needs at least one device"),
         (put("devices", {}), "devices must be a list"),
         (put("devices", [3]), "damaged manifest"),
-        (put("frame_count", 0), "needs at least one frame, found 0"),
+        (put("frame_count", 0), "needs 1 to 10000000 frames, found frame_count 0"),
         (put("frame_count", 1.5), "frame_count must be a whole number, found 1.5"),
         (put("kind", "film"), "kind must be one of import, capture, found 'film'"),
         (lambda d: d.pop("frame_count"), "missing key 'frame_count'"),

@@ -50,7 +50,7 @@ def test_triangles_are_padded(tmp_path: Path) -> None:
     [
         ({"names": np.array(["a", "b", "a", "c", "d", "b"])}, "found twice: a, b"),
         ({"names": np.array(["a", "b"])}, "names"),
-        ({"names": np.arange(6)}, "expected a list of text"),
+        ({"names": np.arange(6)}, "names must hold text"),
         ({"neutral": _arrays()["neutral"] / 10}, "centimetres: multiply neutral and deltas by 10"),
         ({"neutral": _arrays()["neutral"] / 1000}, "metres: multiply neutral and deltas by 1000"),
         ({"neutral": _arrays()["neutral"][:35]}, "V = 35"),

@@ -1,0 +1,52 @@
+"""JSON and TOML files, read so that whatever is wrong with one is told in one line."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from capture.errors import InputError
+
+_FAULTS = (OSError, ValueError, RecursionError)
+"""Unreadable; not text, not that language, a number of too many digits; nested without end."""
+
+
+def read_json(path: Path, kind: type[InputError] = InputError, *, absent: str = "") -> Any:
+    """The parsed JSON of a file.
+
+    Args:
+        path: the file.
+        kind: the class of error to raise.
+        absent: what to say when there is no such file, after its name.
+
+    Raises:
+        InputError: (as `kind`) naming the file, when it is missing or is not JSON.
+    """
+    return _read(path, json.loads, "JSON", kind, absent)
+
+
+def read_toml(path: Path, kind: type[InputError] = InputError, *, absent: str = "") -> Any:
+    """The parsed TOML of a file; arguments and errors as of `read_json`."""
+    return _read(path, tomllib.loads, "TOML", kind, absent)
+
+
+def _read(
+    path: Path, parse: Callable[[str], Any], language: str, kind: type[InputError], absent: str
+) -> Any:
+    try:
+        return parse(Path(path).read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise kind(f"{path}: {absent or 'no such file'}") from error
+    except _FAULTS as error:
+        raise kind(f"{path}: not readable as {language}: {_reason(error)}") from error
+
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, RecursionError):
+        return "nested too deeply"
+    if isinstance(error, OSError):
+        return error.strerror or str(error)
+    return str(error)

@@ -217,8 +217,10 @@ class FrameReader:
                         int(metadata["channels"]), metadata["dtype"],
                     )  # fmt: skip
                     return metadata["device"], layout, body + length
-                except (KeyError, ValueError) as error:
+                except KeyError as error:
                     raise TakeError(f"{self.path}: not written by likeness: no {error}") from error
+                except (ValueError, TakeError) as error:
+                    raise TakeError(f"{self.path}: damaged channel record: {error}") from error
             offset = body + length
         raise TakeError(f"{self.path}: cut before its first frame: no channel record")
 

@@ -110,7 +110,9 @@ def parse_chunks(summary_bytes: bytes) -> list[tuple[int, int]]:
     chunks, at = [], 0
     while at + RECORD.size <= len(summary_bytes):
         opcode, length = RECORD.unpack_from(summary_bytes, at)
-        if opcode == Op.CHUNK_INDEX:
+        if at + RECORD.size + length > len(summary_bytes):
+            break
+        if opcode == Op.CHUNK_INDEX and length >= 32:
             offset, size = struct.unpack_from("<QQ", summary_bytes, at + RECORD.size + 16)
             chunks.append((int(offset), int(size)))
         at += RECORD.size + length

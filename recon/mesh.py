@@ -97,9 +97,9 @@ def read_obj(path: Path) -> Mesh:
             continue
         try:
             if words[0] == "v":
-                positions.append([float(word) for word in words[1:4]])
+                positions.append(_floats(words[1:4], 3))
             elif words[0] == "vt":
-                texture.append([float(word) for word in words[1:3]])
+                texture.append(_floats(words[1:3], 2))
             else:
                 face, corner = _face(words[1:], len(positions), len(texture))
                 faces.append(face)
@@ -148,6 +148,12 @@ def _face(words: list[str], positions: int, texture: int) -> tuple[list[int], li
         face.append(_index(parts[0], positions))
         corner.append(_index(parts[1], texture) if len(parts) > 1 and parts[1] else -1)
     return face + [-1] * (4 - len(face)), corner + [-1] * (4 - len(corner))
+
+
+def _floats(words: list[str], count: int) -> list[float]:
+    if len(words) != count:
+        raise ValueError(f"{count} numbers are needed, found {len(words)}")
+    return [float(word) for word in words]
 
 
 def _index(word: str, count: int) -> int:

@@ -201,7 +201,8 @@ def _check_numbers(numbered: dict[str, dict[int, Path]], problems: list[str]) ->
         problems.append(
             f"frame counts differ: {usual} in {counts[usual]} cameras, {', '.join(parts)}"
         )
-    nowhere = [n for n in _span(together) if n not in set(together)]
+    there = set(together)
+    nowhere = [n for n in _span(together) if n not in there]
     if nowhere:
         problems.append(f"no camera has frame {_listed(nowhere)}")
     for name, numbers in numbered.items():

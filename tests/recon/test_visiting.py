@@ -243,7 +243,7 @@ BAD = [
     (number_twice, r"cam02/3\.png: frame 3 is there twice, also as 0003\.png"),
     (not_json, r"cameras\.json: not readable as JSON"),
     (unknown_key, r"cam00: camera: unknown key 'focal'"),
-    (broken_neutral, r"neutral\.obj:3: expected"),
+    (broken_neutral, r"neutral\.obj:2: expected"),
     (no_images, r"no image found"),
 ]
 

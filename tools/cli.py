@@ -8,13 +8,15 @@ from __future__ import annotations
 import difflib
 import importlib
 import json
+import math
+import os
+import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 from typing import Any
-
-import tyro
 
 from capture.errors import InputError, LikenessError
 from capture.product import code_version
@@ -45,6 +47,13 @@ _STAGES = {
 }
 
 
+_OWN = ("capture", "recon", "track", "rig", "tools")
+_MISPLACED = (
+    FileNotFoundError, FileExistsError, NotADirectoryError, IsADirectoryError, PermissionError
+)  # fmt: skip
+"""What the system says of a path that the user should have chosen otherwise: bad input."""
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one verb and return the exit status.
 
@@ -72,7 +81,8 @@ def _run(verb: str, rest: list[str]) -> int:
     try:
         module = importlib.import_module(_MODULES.get(verb, f"tools.verbs.{verb}"))
         options = _parse(verb, module, rest)
-        report: dict[str, Any] = module.run(options, bar)
+        with _stdout_for_the_report():
+            report: dict[str, Any] = module.run(options, bar)
     except SystemExit as stop:  # tyro prints usage and leaves with 0 (help) or 2 (usage)
         return stop.code if isinstance(stop.code, int) else 2
     except KeyboardInterrupt:
@@ -83,36 +93,90 @@ def _run(verb: str, rest: list[str]) -> int:
         bar.close()
         print(f"likeness {verb}: {error}", file=sys.stderr)
         return error.exit_status
-    except OSError as error:
+    except ModuleNotFoundError as error:
         bar.close()
-        print(f"likeness {verb}: {error}", file=sys.stderr)
-        return 1
+        if error.name is None or error.name.partition(".")[0] in _OWN:
+            raise
+        print(f"likeness {verb}: {_missing_package(error.name)}", file=sys.stderr)
+        return 2
+    except (OSError, MemoryError) as error:
+        bar.close()
+        print(f"likeness {verb}: {_told(error)}", file=sys.stderr)
+        return 2 if isinstance(error, _MISPLACED) else 1
     bar.close()
     if options.json:
-        print(json.dumps(report, default=str))
+        print(json.dumps(_plain(report), default=str, allow_nan=False))
     else:
         for key, value in report.items():
             print(f"{key}: {value}", file=sys.stderr)
     return 0
 
 
+@contextmanager
+def _stdout_for_the_report() -> Iterator[None]:
+    """Send to stderr whatever libraries print, compiled ones too: stdout is for the report."""
+    sys.stdout.flush()
+    kept = os.dup(1)
+    written, sys.stdout = sys.stdout, sys.stderr
+    os.dup2(2, 1)
+    try:
+        yield
+    finally:
+        sys.stdout = written
+        os.dup2(kept, 1)
+        os.close(kept)
+
+
+def _plain(value: Any) -> Any:
+    """The value with null for what JSON has no word for: NaN and infinity."""
+    if isinstance(value, dict):
+        return {key: _plain(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(inner) for inner in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _missing_package(name: str) -> str:
+    package = name.partition(".")[0]
+    return (
+        f"this verb needs the Python package {package}, which is not installed; "
+        "install what the project needs with `make setup`"
+    )
+
+
+def _told(error: OSError | MemoryError) -> str:
+    """One line: the path that was meant, without the temporary name it was written under."""
+    if isinstance(error, MemoryError):
+        return f"not enough memory: {error}" if str(error) else "not enough memory"
+    if error.filename is None:
+        return str(error)
+    path = re.sub(r"\.(partial|old)-\d+-", "", str(error.filename))
+    return f"{path}: {error.strerror}"
+
+
 def _parse(verb: str, module: ModuleType, rest: list[str]) -> Any:
     """Options of a verb; with --config, the settings file gives the defaults of the settings."""
+    import tyro  # late, so that Ctrl-C is answered from the first moment on
+
     config = _config_path(rest)
     prog = f"likeness {verb}"
-    if config is None or verb not in _STAGES:
+    settings: dict[str, Any] = {}
+    if config is not None:
+        stages = {
+            stage: getattr(importlib.import_module(home), name)
+            for stage, (home, name) in _STAGES.items()
+        }
+        settings = read_settings(config, stages)
+    if verb not in settings:
         return tyro.cli(module.Arguments, args=rest, prog=prog, description=module.__doc__)
-    stages = {
-        stage: getattr(importlib.import_module(home), name)
-        for stage, (home, name) in _STAGES.items()
-    }
-    settings = read_settings(config, stages)[verb]
     return tyro.cli(
         module.Arguments,
         args=rest,
         prog=prog,
         description=module.__doc__,
-        default=module.Arguments(**dict.fromkeys(module.REQUIRED, tyro.MISSING), settings=settings),
+        default=module.Arguments(
+            **dict.fromkeys(module.REQUIRED, tyro.MISSING), settings=settings[verb]
+        ),
     )
 
 

@@ -125,3 +125,67 @@ def test_an_interrupt_exits_130_and_leaves_nothing_half_written(tmp_path: Path) 
     assert process.returncode == 130, message
     assert b"Traceback" not in message
     assert sorted(p.name for p in tmp_path.iterdir()) == ["visit"]
+
+
+def test_the_system_s_refusal_of_a_path_is_bad_input(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "visit").mkdir()
+    visit = write_visit(tmp_path / "visit", small_array())
+    (tmp_path / "file").write_text("mine")
+    assert main(["import", str(visit), "--out", str(tmp_path / "file" / "take")]) == 2
+    message = capsys.readouterr().err.splitlines()[-1]
+    assert message.startswith(f"likeness import: {tmp_path / 'file'}")
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_a_config_is_read_by_every_verb(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["verify", str(tmp_path), "--config", str(tmp_path / "none.toml")]) == 2
+    assert "none.toml: no such settings file" in capsys.readouterr().err
+
+
+def test_a_report_of_a_rig_that_is_not_there_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["report", str(tmp_path), "--rig", str(tmp_path / "norig"), "--out"]
+    assert main([*words, str(tmp_path / "page.html")]) == 2
+    assert "no rig.npz" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+PROGRAM = """
+import os, sys
+from tools import cli
+from tools.verbs.options import Options as Arguments
+{before}
+def run(arguments, progress):
+    {body}
+cli.VERBS["shout"], cli._MODULES["shout"] = "a verb of the test", "__main__"
+raise SystemExit(cli.main(["shout", "--json"]))
+"""
+
+
+def spoken(body: str, before: str = "") -> subprocess.CompletedProcess[str]:
+    """A verb whose work is `body`, run by the program in a process of its own."""
+    return subprocess.run(
+        [sys.executable, "-c", PROGRAM.format(body=body, before=before)],
+        cwd=ROOT, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+
+
+def test_only_the_report_reaches_stdout_and_it_is_json() -> None:
+    body = 'print("python"); os.write(1, b"compiled"); return {"rms": float("nan"), "n": [1.5]}'
+    done = spoken(body)
+    assert done.returncode == 0
+    assert json.loads(done.stdout, parse_constant=pytest.fail) == {"rms": None, "n": [1.5]}
+    assert "python" in done.stderr
+    assert "compiled" in done.stderr
+
+
+def test_no_memory_and_no_package_are_told_in_a_line() -> None:
+    full = spoken("raise MemoryError")
+    assert (full.returncode, "Traceback" in full.stderr) == (1, False)
+    assert "not enough memory" in full.stderr
+    bare = spoken("import open3d.core", before='sys.modules["open3d"] = None')
+    assert (bare.returncode, "Traceback" in bare.stderr) == (2, False)
+    assert "open3d, which is not installed" in bare.stderr

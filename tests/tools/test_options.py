@@ -28,3 +28,8 @@ def test_frames_are_chosen(text: str | None, expected: list[int]) -> None:
 def test_frames_that_cannot_be_are_refused(text: str) -> None:
     with pytest.raises(InputError, match=r"--frames .*3\.\.14"):
         parse_frames(text, FRAMES)
+
+
+def test_a_range_of_endless_digits_is_refused_at_once() -> None:
+    with pytest.raises(InputError, match=r"no frame 3; the take has 0\.\.2"):
+        parse_frames("0:100000000000000000000000", (0, 1, 2))

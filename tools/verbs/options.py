@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -39,15 +40,17 @@ def parse_frames(text: str | None, frames: tuple[int, ...]) -> list[int]:
             first = frames[0] if parts[0] is None else parts[0]
             last = frames[-1] + 1 if parts[1] is None else parts[1]
             step = parts[2] if len(parts) == 3 and parts[2] is not None else 1
-            wanted = list(range(first, last, step))
+            wanted: Sequence[int] = range(first, last, step)
         else:
             wanted = [int(part) for part in text.split(",")]
     except (ValueError, IndexError) as error:
         raise InputError(
             f"--frames {text}: expected A:B (B excluded), A:B:STEP, A, or A,B,C; {offer}"
         ) from error
-    missing = [frame for frame in wanted if frame not in frames]
-    if missing or not wanted:
-        what = f"no frame {missing[0]}" if missing else "it chooses no frame"
+    there = set(frames)
+    # Lazily: a range typed with too many digits has no list that fits in memory.
+    missing = next((frame for frame in wanted if frame not in there), None)
+    if missing is not None or not wanted:
+        what = "it chooses no frame" if missing is None else f"no frame {missing}"
         raise InputError(f"--frames {text}: {what}; {offer}")
-    return wanted
+    return list(wanted)

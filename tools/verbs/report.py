@@ -11,6 +11,7 @@ from typing import Any
 
 import tyro
 
+from capture.errors import InputError
 from capture.progress import Progress
 from tools.report import report_for_take
 from tools.verbs.options import Options
@@ -29,6 +30,14 @@ class Arguments(Options):
 
 
 def run(arguments: Arguments, progress: Progress) -> dict[str, Any]:
-    """Write the page and report its size."""
+    """Write the page and report its size.
+
+    Raises:
+        InputError: when --rig names a folder without a rig.
+    """
+    if arguments.rig is not None and not (arguments.rig / "rig.npz").is_file():
+        raise InputError(
+            f"{arguments.rig}: expected a folder that `likeness rig` wrote, found no rig.npz in it"
+        )
     report_for_take(arguments.take, arguments.out, rig=arguments.rig, progress=progress)
     return {"page": str(arguments.out), "bytes": arguments.out.stat().st_size}

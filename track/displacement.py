@@ -46,24 +46,6 @@ class Displacements:
         unit: Floats = mixed / np.linalg.norm(mixed, axis=1, keepdims=True)
         return unit
 
-    def points(self, vertices: Floats, triangles: Ints32) -> Floats:
-        """The bound points (N, 3) on a mesh with vertices (V, 3): b + h n."""
-        base = np.einsum("nk,nkx->nx", self.barycentric, vertices[self.corners])
-        moved: Floats = base + self.height_mm[:, None] * self.normals(vertices, triangles)
-        return moved
-
-    def base_targets(self, targets: Floats, vertices: Floats, triangles: Ints32) -> Floats:
-        """Where the base points (N, 3) should go so that the bound points reach `targets`.
-
-        c = u - h n, the normal being that of the current estimate; solved again as it improves.
-
-        References:
-            Ma et al. 2016, section 2.2, the equation of the constraints c_j.
-        """
-        check_shape(targets=(targets, "N 3"), height_mm=(self.height_mm, "N"))
-        wanted: Floats = targets - self.height_mm[:, None] * self.normals(vertices, triangles)
-        return wanted
-
 
 def bind_points(points: Floats, vertices: Floats, triangles: Ints32) -> Displacements:
     """Find each point's base point: where the interpolated normal passes through the point.

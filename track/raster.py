@@ -118,13 +118,14 @@ class Rasterizer:
         check_shape(vertices=(vertices, f"{self._vertex_count} 3"))
         pixels, depth, good = _project(camera, np.asarray(vertices, dtype=np.float64))
         clip = self._clip_corners(camera, pixels, depth, good)
-        moved = np.zeros_like(clip)
+        moved = None
         if moved_vertices is not None:
             check_shape(vertices=(vertices, "V 3"), moved_vertices=(moved_vertices, "V 3"))
             target, far, there = _project(camera, np.asarray(moved_vertices, dtype=np.float64))
             lines = np.where(there[:, None], np.column_stack([target - pixels, far]), np.nan)
+            moved = np.zeros_like(clip)
             moved[:, :3] = lines[self._triangles.ravel()]
-        triangle, surface, motion = self._draw(camera, clip, moved, moved_vertices is not None)
+        triangle, surface, motion = self._draw(camera, clip, moved)
         empty = triangle < 0
         surface[empty, 3] = np.nan
         if motion is not None:
@@ -154,7 +155,7 @@ class Rasterizer:
         return corners
 
     def _draw(
-        self, camera: Camera, clip: Floats32, moved: Floats32, want_motion: bool
+        self, camera: Camera, clip: Floats32, moved: Floats32 | None
     ) -> tuple[Ints32, Floats32, Floats32 | None]:
         height, width = camera.height, camera.width
         with _LOCK, gl_context() as context:
@@ -163,7 +164,8 @@ class Rasterizer:
                 self._frames[width, height] = _framebuffer(context, width, height)
             frame = self._frames[width, height]
             self._clip.write(np.ascontiguousarray(clip).tobytes())
-            self._moved.write(np.ascontiguousarray(moved).tobytes())
+            if moved is not None:
+                self._moved.write(np.ascontiguousarray(moved).tobytes())
             frame.use()
             context.enable_only(context.DEPTH_TEST)
             frame.clear()
@@ -174,7 +176,7 @@ class Rasterizer:
             frame.read_into(ids, components=1, attachment=0, dtype="i4")
             frame.read_into(surface, components=4, attachment=1, dtype="f4")
             motion = None
-            if want_motion:
+            if moved is not None:
                 motion = np.empty((height, width, 4), np.float32)
                 frame.read_into(motion, components=4, attachment=2, dtype="f4")
         return ids - 1, surface, motion

@@ -16,9 +16,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 
-from capture.arrays import Floats, Floats32, Ints32
+from capture.arrays import Floats, Floats32, Ints, Ints32
 from capture.camera import Camera
 from capture.errors import SettingsError, SolveError
+from recon.surface import Scan
 from track.flow import FlowMatches, refine_flow, search_flow
 from track.guide import GuidedView, guided_view
 from track.laplacian import Constraints, LaplacianDeformer, Stiffness
@@ -28,12 +29,15 @@ from track.pyramid import camera_at_level, image_pyramid
 from track.raster import Rasterizer
 from track.reference import ReferenceLevel, facing_normals, reference_level, visible_samples
 from track.rigid import fit_similarity
+from track.scan_depth import ScanDepth, depth_observations
 from track.schedule import Step
 from track.surface_samples import SurfaceSamples, sample_surface, vertex_rings
 
 _PRIOR_MM = 1.0
 _SURE = 0.25  # confidence from which a vertex carries its neighbours into the next frame
-_SINGLE_VIEW = 0.02  # weight of a sample that one view alone sees: its depth is the estimate's
+_SINGLE_VIEW = 0.02  # weight of a sample that one view alone sees, and no scan: of unknown depth
+_AGREED = 2  # witnesses, views or a view and the scan, that fix a sample's place
+_FEW = 2  # a sample that no more views than this see gets its depth from the scan too
 _RINGS = 3  # edges within which two triangles count as one piece of surface
 
 
@@ -44,7 +48,7 @@ class FrameResult:
     Attributes:
         vertices: (V, 3) world mm.
         confidence: (V,) 0..1.
-        samples: how many samples two or more views agree on.
+        samples: how many samples two or more views, or a view and the scan, agree on.
         correlation: mean NCC of the matches of the last step.
         residual_px: median distance between matches and the projected lifted points.
         views: mean number of views that agree on a sample.
@@ -147,12 +151,16 @@ class Registrar:
             constraints, start=rigid.apply(self._neutral), data_weight=10.0, rotation_iterations=3
         )
 
-    def register(self, start: Floats, images: Mapping[str, Floats32]) -> FrameResult:
+    def register(
+        self, start: Floats, images: Mapping[str, Floats32], scan: Scan | None = None
+    ) -> FrameResult:
         """Find the mesh in a frame.
 
         Args:
             start: (V, 3) where to begin, world mm.
             images: the frame's images, float32 mono; views without a reference are not used.
+            scan: the frame's own, world mm, where there is one: it tells the depth of samples
+                that one or two views alone see.
 
         Returns:
             The registered mesh and its figures.
@@ -166,15 +174,20 @@ class Registrar:
         pyramids = {name: image_pyramid(images[name], self._levels) for name in usable}
         vertices = start
         occluders: dict[str, tuple[Floats32, float]] = {}
+        depth: ScanDepth | None = None
+        agreed = self._seen
         for index, step in enumerate(self._options.steps):
             if index == 1:  # the first round has brought the mesh within the tolerance
                 occluders = {name: self._depth(name, vertices) for name in usable}
+            if scan is not None and depth is None and index > 0 and step.level == 0:
+                depth = self._scan_depth(scan, vertices, agreed)
             scaled = {
                 name: (depth, scale / 2**step.level) for name, (depth, scale) in occluders.items()
             }
             views = {name: pyramids[name][step.level] for name in usable}
-            lifted, score = self._measure(step, vertices, views, scaled)
+            lifted, score = self._measure(step, vertices, views, scaled, depth)
             vertices, weights = self._solve(step, vertices, lifted)
+            agreed = lifted.views
         return self._result(vertices, lifted, weights, score)
 
     def _reference(self, camera: Camera, image: Floats32) -> list[ReferenceLevel]:
@@ -220,6 +233,7 @@ class Registrar:
         vertices: Floats,
         images: Mapping[str, Floats32],
         occluders: Mapping[str, tuple[Floats32, float]],
+        depth: ScanDepth | None,
     ) -> tuple[Lifted, float]:
         skin = self._skin(vertices)
         points = self._samples.points(skin)
@@ -235,11 +249,35 @@ class Registrar:
         measured = list(self._pool.map(measure, images))  # in the order of the views
         every = np.concatenate([scores for _, scores in measured])
         parts = [seen for seen, _ in measured]
+        if depth is not None:
+            parts += self._depths(depth, dict(zip(images, parts, strict=True)), skin)
         lifted = triangulate(merged(parts), len(self._samples), step.scale_px, _PRIOR_MM)
         return lifted, float(every.mean()) if len(every) else 0.0
 
+    def _scan_depth(self, scan: Scan, vertices: Floats, agreed: Ints) -> ScanDepth:
+        """The scan around samples that few views agreed on (N,), and any view can see."""
+        poor = (self._seen > 0) & (agreed <= _FEW)
+        return ScanDepth(scan, self._samples.points(self._skin(vertices))[poor])
+
+    def _depths(
+        self, depth: ScanDepth, seen: Mapping[str, Observations], skin: Floats
+    ) -> list[Observations]:
+        """What the scan adds to the matches of samples that few views see."""
+        times = np.zeros(len(self._samples), np.int64)
+        for part in seen.values():
+            times[part.sample] += 1
+        normals = self._samples.points(facing_normals(skin, self._triangles))
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+        estimate = (self._samples.points(skin), normals)
+        return [
+            depth_observations(
+                depth, self._views[name][0].camera, part, times[part.sample] <= _FEW, estimate
+            )
+            for name, part in seen.items()
+        ]
+
     def _match(self, step: Step, level: ReferenceLevel, view: GuidedView) -> FlowMatches:
-        stride = self._options.search_stride if step.level == self._levels - 1 else 1
+        stride = self._options.search_stride if step is self._options.steps[0] else 1
         chosen = level.samples % stride == 0
         found = search_flow(level, view, chosen, step.search_px)
         return refine_flow(level, view, found.displacement, step.iterations)
@@ -268,7 +306,7 @@ class Registrar:
     def _result(
         self, vertices: Floats, lifted: Lifted, weights: Floats, score: float
     ) -> FrameResult:
-        agreed = lifted.views >= 2
+        agreed = lifted.views >= _AGREED
         residual = lifted.residual_px[agreed]
         sure = np.clip(weights / max(_typical(weights), 1e-9), 0.0, 1.0)
         return FrameResult(

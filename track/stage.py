@@ -60,8 +60,9 @@ class TrackSettings:
         search_stride: in the first round every how manieth sample is matched.
         rotation_iterations: updates of the local frames in each solve.
         extrapolation: share of the head's last motion expected again.
-        use_scan: match the skin of the first frame's scan, at its height over the neutral, where
-            `likeness recon` made one; which matters where the neutral is not quite on the skin.
+        use_scan: use the scans that `likeness recon` made. The first frame's tells how far the
+            skin lies over the neutral, which matters where the neutral is not quite on it; that
+            of any other frame the depth of skin that one or two views alone see there.
     """
 
     spacing_mm: float = 6.0
@@ -123,13 +124,14 @@ def track(
         SolveError: when a solve does not reach an answer.
     """
     out = take.products / "track" / "performance.npz"
-    record = _record(take, neutral, settings, landmarks)
+    frames = _frames(take)
+    scans = _scans(take) if settings.use_scan else {}
+    records = _records(settings, _inputs(take, neutral, landmarks), frames, scans)
+    record = records[frames[-1]]
     if is_current(out, record):
         return read_performance(out)
-    cameras = take.cameras()
-    frames = _frames(take)
-    shelf = _FrameShelf(out.parent / "frames", record)
-    work = _Work(take, neutral, cameras, settings)
+    work = _Work(take, neutral, take.cameras(), settings, scans)
+    shelf = _FrameShelf(out.parent / "frames", records)
     results = [work.reference(frames[0])]
     progress(1, len(frames), "track")
     for done, frame in enumerate(frames[1:], start=2):
@@ -157,15 +159,15 @@ class _Tracked:
 
 
 class _FrameShelf:
-    """Finished frames on disk, valid for one record."""
+    """Finished frames on disk, each valid for its record."""
 
-    def __init__(self, folder: Path, record: Mapping[str, Any]) -> None:
-        self._folder, self._record = folder, record
+    def __init__(self, folder: Path, records: Mapping[int, Mapping[str, Any]]) -> None:
+        self._folder, self._records = folder, records
 
     def load(self, frame: int, vertex_count: int) -> _Tracked | None:
         """The stored frame, or None when there is none that was made this way."""
         path = self._path(frame)
-        if not is_current(path, self._record):
+        if not is_current(path, self._records[frame]):
             return None
         try:
             held = read_archive(path, required=("vertices", "confidence", "figures"))
@@ -187,7 +189,7 @@ class _FrameShelf:
             path,
             {"vertices": tracked.vertices, "confidence": tracked.confidence, "figures": figures},
         )
-        write_record(path, self._record)
+        write_record(path, self._records[frame])
 
     def _path(self, frame: int) -> Path:
         return self._folder / f"frame_{frame:04d}.npz"
@@ -197,10 +199,15 @@ class _Work:
     """The registrar of a take, made when a frame is first asked for."""
 
     def __init__(
-        self, take: Take, neutral: Mesh, cameras: CameraArray, settings: TrackSettings
+        self,
+        take: Take,
+        neutral: Mesh,
+        cameras: CameraArray,
+        settings: TrackSettings,
+        scans: Mapping[int, Path],
     ) -> None:
         self._take, self._neutral, self._settings = take, neutral, settings
-        self._cameras = cameras
+        self._cameras, self._scans = cameras, scans
         self._registrar: Registrar | None = None
 
     def reference(self, frame: int) -> _Tracked:
@@ -239,7 +246,8 @@ class _Work:
         else:
             registrar = self._made()
             sure = before[-1].confidence.astype(np.float64)
-            result = registrar.register(registrar.carried(start, sure), images)
+            scan = load_scan(self._scans[frame]) if frame in self._scans else None
+            result = registrar.register(registrar.carried(start, sure), images, scan)
         figures = {
             "samples": float(result.samples),
             "correlation": result.correlation,
@@ -284,14 +292,12 @@ class _Work:
 
     def _heights(self) -> Floats | None:
         """How far the first frame's scan lies over the neutral, where there is such a scan."""
-        path = _scan_path(self._take)
-        if not self._settings.use_scan or not path.is_file():
+        first = self._take.frames[0]
+        if first not in self._scans:
             return None
-        scan = load_scan(path)
         mesh = self._neutral
-        return skin_heights(
-            mesh.vertices, mesh.triangles, (scan.vertices, scan.triangles), _SKIN_LIMIT_MM
-        )
+        scan = load_scan(self._scans[first])
+        return skin_heights(mesh.vertices, mesh.triangles, scan, _SKIN_LIMIT_MM)
 
     def _images(self, frame: int) -> dict[str, Floats32]:
         take = self._take
@@ -323,13 +329,15 @@ def _frames(take: Take) -> tuple[int, ...]:
     return take.frames
 
 
-def _scan_path(take: Take) -> Path:
-    return take.products / "recon" / f"frame_{take.frames[0]:04d}.ply"
+def _scans(take: Take) -> dict[int, Path]:
+    """The scans that there are, by frame."""
+    folder = take.products / "recon"
+    paths = {frame: folder / f"frame_{frame:04d}.ply" for frame in take.frames}
+    return {frame: path for frame, path in paths.items() if path.is_file()}
 
 
-def _record(
-    take: Take, neutral: Mesh, settings: TrackSettings, landmarks: Path | None
-) -> dict[str, Any]:
+def _inputs(take: Take, neutral: Mesh, landmarks: Path | None) -> dict[str, str]:
+    """Hashes of what every frame is made from."""
     shape = hashlib.sha256(neutral.vertices.tobytes() + neutral.polygons.tobytes()).hexdigest()
     inputs = {"take": take.input_hash(), "neutral": shape}
     if landmarks is not None:
@@ -339,9 +347,27 @@ def _record(
         except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
             raise TakeError(f"{landmarks}: expected landmarks as JSON: {error}") from error
         inputs["landmarks"] = hashlib.sha256(text.encode()).hexdigest()
-    if settings.use_scan and take.frames and _scan_path(take).is_file():
-        inputs["scan"] = hash_file(_scan_path(take))
-    return stage_record("track", settings, inputs)
+    return inputs
+
+
+def _records(
+    settings: TrackSettings,
+    inputs: Mapping[str, str],
+    frames: tuple[int, ...],
+    scans: Mapping[int, Path],
+) -> dict[int, dict[str, Any]]:
+    """What each frame is made from: its scan and those before it, since it begins from them.
+
+    A new scan thus makes its frame and the later ones again, as if it had been there at first. The
+    last frame's record is that of the performance.
+    """
+    digest = hashlib.sha256()
+    out = {}
+    for frame in frames:
+        if frame in scans:
+            digest.update(f"{frame} {hash_file(scans[frame])}\n".encode())
+        out[frame] = stage_record("track", settings, {**inputs, "scans": digest.hexdigest()})
+    return out
 
 
 def _assemble(

@@ -12,6 +12,7 @@ from capture.camera import Camera, CameraArray
 from capture.camera_file import write_cameras
 from capture.pose import Pose
 from recon.mesh import Mesh
+from recon.surface import Scan, write_ply
 from tests.synthetic import looking_at
 from track.raster import Rasterizer
 
@@ -78,10 +79,12 @@ def picture(camera: Camera, mesh: Mesh, vertices: Floats, gain: float = 1.0) -> 
     return (gain * image).astype(np.float32)
 
 
-def write_patch_visit(folder: Path, amounts: list[float], seed: int = 0) -> tuple[Mesh, Floats]:
+def write_patch_visit(
+    folder: Path, amounts: list[float], seed: int = 0, cameras: CameraArray | None = None
+) -> tuple[Mesh, Floats]:
     """A visiting take of the patch, with noise of 1.5 DN; returns the mesh and truth (F, V, 3)."""
     rng = np.random.default_rng(seed)
-    mesh, cameras = patch_mesh(), patch_array()
+    mesh, cameras = patch_mesh(), cameras or patch_array()
     truth = np.stack([patch_motion(mesh.vertices, amount) for amount in amounts])
     write_cameras(folder / "cameras.json", cameras)
     for camera in cameras:
@@ -91,6 +94,22 @@ def write_patch_visit(folder: Path, amounts: list[float], seed: int = 0) -> tupl
             noisy = np.clip(np.rint(grey + rng.normal(0, 1.5, grey.shape)), 0, 255)
             cv2.imwrite(str(folder / camera.name / f"{f:04d}.png"), noisy.astype(np.uint8))
     return mesh, truth
+
+
+def write_patch_scan(take: Path, frame: int, mesh: Mesh, vertices: Floats, seed: int = 0) -> Path:
+    """A scan of the patch with vertices (V, 3) at a frame of a take, with noise of 0.05 mm."""
+    noise = np.random.default_rng(seed).normal(0.0, 0.05, vertices.shape)
+    path = take / "products" / "recon" / f"frame_{frame:04d}.ply"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    moved = mesh.with_vertices(vertices + noise)
+    scan = Scan(
+        vertices=moved.vertices.astype(np.float32),
+        triangles=moved.triangles,
+        normals=moved.normals().astype(np.float32),
+        confidence=np.ones(len(vertices), np.float32),
+    )
+    write_ply(path, scan)
+    return path
 
 
 def _raster(triangles: Ints32, count: int) -> Rasterizer:

@@ -1,11 +1,11 @@
-"""Base points and heights: identity, the normal law, rigid invariance, constraint targets."""
+"""Base points and heights: identity, the normal law, rigid invariance."""
 
 import numpy as np
 
 from capture.arrays import Floats, Ints32
 from capture.pose import Pose
 from recon.mesh import vertex_normals
-from track.displacement import bind_points
+from track.displacement import Displacements, bind_points
 
 
 def _bowl(side: int = 10) -> tuple[Floats, Ints32]:
@@ -31,15 +31,21 @@ def _near(vertices: Floats, triangles: Ints32, seed: int) -> tuple[Floats, Float
     return np.einsum("nk,nkx->nx", weights, vertices[chosen]) + height[:, None] * n, height
 
 
+def _placed(bound: Displacements, vertices: Floats, triangles: Ints32) -> tuple[Floats, Floats]:
+    """Base points b and bound points b + h n (N, 3) on a mesh."""
+    base = np.einsum("nk,nkx->nx", bound.barycentric, vertices[bound.corners])
+    return base, base + bound.height_mm[:, None] * bound.normals(vertices, triangles)
+
+
 def test_base_point_and_height_reproduce_the_point() -> None:
     vertices, triangles = _bowl()
     points, height = _near(vertices, triangles, 1)
     bound = bind_points(points, vertices, triangles)
     assert (bound.triangle >= 0).all()
-    np.testing.assert_allclose(bound.points(vertices, triangles), points, atol=1e-9)  # mm
+    base, placed = _placed(bound, vertices, triangles)
+    np.testing.assert_allclose(placed, points, atol=1e-9)  # mm
     assert (np.abs(bound.height_mm) <= np.abs(height) + 1e-9).all()
     np.testing.assert_allclose(bound.height_mm, height, atol=1e-8)  # mm
-    base = points - bound.height_mm[:, None] * bound.normals(vertices, triangles)
     across = np.cross(points - base, bound.normals(vertices, triangles))
     assert np.abs(across).max() < 1e-9  # (u - b) x n = 0
 
@@ -61,10 +67,8 @@ def test_a_rigid_motion_of_the_mesh_carries_the_points() -> None:
         rng = np.random.default_rng(seed)
         motion = Pose.from_rotation_vector(rng.normal(0, 1, 3), rng.normal(0, 50, 3))
         moved = motion.apply(vertices)
-        np.testing.assert_allclose(bound.points(moved, triangles), motion.apply(points), atol=1e-8)
-        targets = bound.base_targets(motion.apply(points), moved, triangles)
-        base = np.einsum("nk,nkx->nx", bound.barycentric, moved[bound.corners])
-        np.testing.assert_allclose(targets, base, atol=1e-8)  # mm
+        _, placed = _placed(bound, moved, triangles)
+        np.testing.assert_allclose(placed, motion.apply(points), atol=1e-8)  # mm
 
 
 def test_a_point_beyond_the_border_is_left_unbound() -> None:

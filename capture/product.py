@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 _CHUNK = 1 << 20
+_SEAL = "product_sha256"
 _FLOORS = ("capture", "recon", "track", "rig")  # lowest first; names only, nothing is imported
 
 
@@ -35,7 +36,11 @@ def replacing(path: Path) -> Iterator[Path]:
         if partial.is_dir() and path.exists():
             old = path.with_name(f".old-{os.getpid()}-{path.name}")
             path.replace(old)
-            partial.replace(path)
+            try:
+                partial.replace(path)
+            except BaseException:
+                old.replace(path)
+                raise
             _remove(old)
         else:
             partial.replace(path)
@@ -85,21 +90,23 @@ def code_version() -> str:
 
 
 def is_current(product: Path, record: Mapping[str, Any]) -> bool:
-    """Whether `product` exists and was made exactly as `record` says."""
+    """Whether `product` was made exactly as `record` says, and is as it was then, byte for byte."""
     beside = record_path(product)
-    if not Path(product).exists() or not beside.exists():
+    if not Path(product).is_file() or not beside.exists():
         return False
     try:
         found = json.loads(beside.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError):
+    except (OSError, ValueError, RecursionError):
         return False
-    return bool(found == record)
+    same = isinstance(found, dict) and {**found, _SEAL: None} == {**record, _SEAL: None}
+    return same and found.get(_SEAL) == hash_file(product)
 
 
 def write_record(product: Path, record: Mapping[str, Any]) -> None:
-    """Write the record beside its product."""
+    """Write the record beside its product, which is a file, sealed with the hash of its bytes."""
+    sealed = {**record, _SEAL: hash_file(product)}
     with replacing(record_path(product)) as partial:
-        partial.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+        partial.write_text(json.dumps(sealed, indent=1) + "\n", encoding="utf-8")
 
 
 def record_path(product: Path) -> Path:

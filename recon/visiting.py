@@ -74,7 +74,7 @@ def _check_place(source: Path, out: Path) -> None:
 def _inputs_of(out: Path) -> object:
     try:
         found = json.loads(record_path(out / MANIFEST).read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError):
+    except (OSError, ValueError, RecursionError):
         return None
     return found.get("inputs") if isinstance(found, dict) else None
 

@@ -81,3 +81,17 @@ def test_a_product_is_current_until_a_setting_or_an_input_changes(tmp_path: Path
 def test_hashes_are_of_the_bytes(tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(b"abc")
     assert hash_file(tmp_path / "a").startswith("ba7816bf8f01cfea414140de5dae2223")
+
+
+def test_a_product_whose_bytes_changed_is_made_again(tmp_path: Path) -> None:
+    product = tmp_path / "scan.ply"
+    record = stage_record("recon", Knobs(), {"take": "abc"})
+    product.write_bytes(b"whole and sound")
+    write_record(product, record)
+    assert is_current(product, record)
+    product.write_bytes(b"whole and s")
+    assert not is_current(product, record)
+    product.write_bytes(b"whole and sound")
+    assert is_current(product, record)
+    record_path(product).write_text("[" * 100_000)
+    assert not is_current(product, record)

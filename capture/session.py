@@ -157,13 +157,18 @@ class Session:
         return cls(Path(folder), str(document.get("name", Path(folder).name)))
 
     def takes(self) -> tuple[TakeNote, ...]:
-        """All takes, slates in order of name and takes in order of number."""
+        """All takes, slates in order of name and takes in order of number.
+
+        Raises:
+            TakeError: naming a take whose manifest does not say what was recorded.
+        """
         found: list[tuple[str, int, Path, dict[str, Any]]] = []
         for folder in sorted((self.folder / "takes").glob("*/take.json")):
             if folder.parent.name.startswith("."):  # what a killed recording left behind
                 continue
             remarks = dict(Take.open(folder.parent).manifest.remarks)
             if "shot" in remarks and "take_number" in remarks:
+                _check_remarks(folder, remarks)
                 found.append(
                     (remarks["shot"]["slate"], remarks["take_number"], folder.parent, remarks)
                 )
@@ -202,6 +207,20 @@ class Session:
             if matched:
                 numbers.append(int(matched[1]))
         return max(numbers) + 1
+
+
+def _check_remarks(path: Path, remarks: dict[str, Any]) -> None:
+    wanted = {"shot": ("slate", "kind"), "judgement": ("colour", "sentence")}
+    good = isinstance(remarks["take_number"], int) and all(
+        isinstance(remarks.get(table), dict)
+        and all(isinstance(remarks[table].get(key), str) for key in keys)
+        for table, keys in wanted.items()
+    )
+    if not good:
+        raise TakeError(
+            f"{path}: damaged manifest: remarks must hold a take_number, shot (slate, kind) and "
+            "judgement (colour, sentence)"
+        )
 
 
 def record_take(

@@ -229,3 +229,19 @@ def test_verify_finds_what_is_wrong(tmp_path: Path) -> None:
     text = "\n".join(verify_take(Take.open(take.folder)).problems)
     assert "ledger.csv: not readable" in text
     assert "cam02.mcap: expected 6 frames, found" in text
+
+
+@pytest.mark.parametrize(
+    "odd", [{"take_number": "1"}, {"shot": ["smile"]}, {"shot": {"slate": 3}}, {"judgement": None}]
+)
+def test_a_take_that_does_not_say_what_was_recorded_is_named(
+    tmp_path: Path, odd: dict[str, object]
+) -> None:
+    session = Session.create(tmp_path / "s")
+    take = record_take(session, SMILE, array_of(), RecordSettings())
+    path = take.folder / "take.json"
+    document = json.loads(path.read_text())
+    document["remarks"].update(odd)
+    path.write_text(json.dumps(document))
+    with pytest.raises(TakeError, match=r"smile_001/take\.json: damaged manifest: remarks must"):
+        session.takes()

@@ -13,6 +13,7 @@ from capture.errors import TakeError
 HEADER_BYTES = 64
 _FRAME = struct.Struct("<4sHHqQqqdII8x")
 _MARK = b"LKF1"
+_LARGEST_PX = 1 << 28  # 16384 x 16384: a header can claim any size
 
 HEADER_TEXT = """\
 A message is a header of 64 bytes and then the pixels. All numbers are little endian.
@@ -53,6 +54,10 @@ class ImageLayout:
         if self.width < 1 or self.height < 1:
             raise TakeError(
                 f"image size must be at least 1 x 1 px, found {self.width} x {self.height}"
+            )
+        if self.width * self.height > _LARGEST_PX:
+            raise TakeError(
+                f"{self.width} x {self.height} px is beyond what is read ({_LARGEST_PX} px)"
             )
         if self.channels not in (1, 3):
             raise TakeError(f"channels must be 1 (mono) or 3 (RGB), found {self.channels}")

@@ -14,7 +14,6 @@ from capture.errors import TakeError
 from capture.frame_header import ImageLayout
 
 _MAGIC = b"\x89PNG\r\n\x1a\n"
-_LARGEST_PX = 1 << 28  # 16384 x 16384
 _MONO, _RGB, _PALETTE = 0, 2, 3
 _SAMPLES = {_MONO: 1, _RGB: 3, _PALETTE: 1}
 _ADAM7 = (
@@ -87,8 +86,6 @@ def decode_png(data: bytes, path: Path) -> Image:
 
 def _layout(header: bytes, transparent: bool, path: Path) -> ImageLayout:
     width, height, depth, colour = struct.unpack_from(">IIBB", header)
-    if width * height > _LARGEST_PX:
-        raise TakeError(f"{path}: {width} x {height} px is beyond what is read ({_LARGEST_PX} px)")
     if colour not in _SAMPLES or transparent:
         raise TakeError(
             f"{path}: has transparency; expected mono or colour without an alpha channel"

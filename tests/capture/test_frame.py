@@ -7,8 +7,9 @@ import pytest
 
 from capture.clock_model import ClockModel, fit_model, model_of_samples
 from capture.devices.protocol import ClockSample
-from capture.errors import DeviceError, SettingsError
+from capture.errors import DeviceError, SettingsError, TakeError
 from capture.frame import Clock
+from capture.frame_header import ImageLayout
 
 EPOCH_NS = 1_790_000_000_123_456_789  # whole nanoseconds of today do not fit a float
 
@@ -80,3 +81,9 @@ def test_what_has_no_line_is_refused() -> None:
         Clock(drift_ppm=5000)
     with pytest.raises(SettingsError, match="jitter_ns must be 0 or more, found -1"):
         Clock(jitter_ns=-1)
+
+
+@pytest.mark.parametrize("size", [(10**9, 1), (1 << 15, 1 << 15), (0, 5), (5, -1)])
+def test_a_size_that_no_image_has_is_refused(size: tuple[int, int]) -> None:
+    with pytest.raises(TakeError, match=f"{size[0]} x {size[1]}"):
+        ImageLayout(*size, 1, "uint8")

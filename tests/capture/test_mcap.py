@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from mcap.reader import NonSeekingReader, SeekingReader
 from mcap.stream_reader import CRCValidationError
 
+from capture import mcap_records
 from capture.errors import TakeError
 from capture.frame_header import HEADER_BYTES, FrameHeader, ImageLayout
 from capture.mcap import FrameReader, FrameWriter
@@ -263,3 +264,13 @@ def test_other_files_are_refused_by_name(tmp_path: Path) -> None:
         FrameReader(tmp_path / "a.mcap")
     with pytest.raises(TakeError, match=r"b\.mcap: no such file"):
         FrameReader(tmp_path / "b.mcap")
+
+
+def test_a_file_that_claims_a_giant_image_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "cam00.mcap"
+    claims = {"device": "cam00", "width": "1000000000", "height": "1000000000"}
+    claims |= {"channels": "1", "dtype": "uint8"}
+    channel = mcap_records.channel_record("cam00", claims)
+    path.write_bytes(mcap_records.MAGIC + mcap_records.header_record() + channel)
+    with pytest.raises(TakeError, match=r"cam00\.mcap: damaged channel record: 1000000000 x"):
+        FrameReader(path)

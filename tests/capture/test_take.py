@@ -205,3 +205,11 @@ def test_an_interrupted_writer_leaves_no_frame_file(
     with pytest.raises(error):
         fail()
     assert not [path for path in tmp_path.rglob("*") if path.is_file()]
+
+
+def test_a_manifest_that_claims_a_giant_image_is_refused(folder: Path) -> None:
+    document = json.loads((folder / "take.json").read_text())
+    document["devices"][0].update(width=10**9)
+    (folder / "take.json").write_text(json.dumps(document))
+    with pytest.raises(TakeError, match="damaged manifest: 1000000000 x"):
+        Take.open(folder)

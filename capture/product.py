@@ -91,15 +91,15 @@ def code_version() -> str:
 
 def is_current(product: Path, record: Mapping[str, Any]) -> bool:
     """Whether `product` was made exactly as `record` says, and is as it was then, byte for byte."""
-    beside = record_path(product)
-    if not Path(product).is_file() or not beside.exists():
-        return False
-    try:
-        found = json.loads(beside.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
-        return False
-    same = isinstance(found, dict) and {**found, _SEAL: None} == {**record, _SEAL: None}
-    return same and found.get(_SEAL) == hash_file(product)
+    found = _sealed_record(product)
+    return found is not None and {**found, _SEAL: None} == {**record, _SEAL: None}
+
+
+def is_made_of(product: Path, inputs: Mapping[str, str]) -> bool:
+    """Whether `product` is whole and was made of these inputs, whatever the settings and the code."""
+    found = _sealed_record(product)
+    made_of = {} if found is None else found.get("inputs", {})
+    return found is not None and all(made_of.get(key) == inputs[key] for key in inputs)
 
 
 def write_record(product: Path, record: Mapping[str, Any]) -> None:
@@ -112,6 +112,19 @@ def write_record(product: Path, record: Mapping[str, Any]) -> None:
 def record_path(product: Path) -> Path:
     """Where the record of a product stands: `frame_0000.ply` -> `frame_0000.ply.record.json`."""
     return Path(product).with_name(Path(product).name + ".record.json")
+
+
+def _sealed_record(product: Path) -> dict[str, Any] | None:
+    """The record beside a product whose bytes are still those it was sealed with."""
+    beside = record_path(product)
+    if not Path(product).is_file() or not beside.exists():
+        return None
+    try:
+        found = json.loads(beside.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return None
+    whole = isinstance(found, dict) and found.get(_SEAL) == hash_file(product)
+    return found if whole else None
 
 
 def _floor_of(settings: Any) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import numpy as np
 
 from capture.arrays import Floats, Ints
 from capture.camera import CameraArray
+from capture.documents import read_json
 from capture.errors import TakeError, raise_all
 
 _LEAST_SPREAD = np.sin(np.radians(0.5))  # between two rays that are to be met
@@ -97,12 +97,7 @@ def read_landmarks(path: Path, vertex_count: int, cameras: CameraArray) -> Landm
 
 
 def _read(path: Path) -> dict[str, Any]:
-    try:
-        document = json.loads(Path(path).read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise TakeError(f"{path}: no such landmarks file") from error
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise TakeError(f"{path}: not readable as JSON: {error}") from error
+    document = read_json(path, TakeError, absent="no such landmarks file")
     if not isinstance(document, dict):
         raise TakeError(
             f"{path}: expected an object with points or views, found a {type(document).__name__}"
@@ -134,7 +129,7 @@ def _numbers(
     value = mark.get(key)
     try:
         numbers = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         numbers = np.zeros(0)
     if numbers.shape == (count,) and np.isfinite(numbers).all():
         return numbers

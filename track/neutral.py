@@ -17,7 +17,7 @@ from capture.errors import TakeError
 from capture.product import (
     hash_file,
     is_current,
-    record_path,
+    is_made_of,
     replacing,
     stage_record,
     write_record,
@@ -231,13 +231,8 @@ def _scan_path(take: Take, progress: Progress) -> Path:
     """The scan of the first frame, made when it is missing or of other frames or cameras."""
     frame = take.frames[0]
     path = take.products / "recon" / f"frame_{frame:04d}.ply"
-    if path.exists() and record_path(path).exists():
-        try:
-            record = json.loads(record_path(path).read_text(encoding="utf-8"))
-        except (OSError, UnicodeDecodeError, json.JSONDecodeError):
-            record = {}
-        if record.get("inputs", {}).get("take") == take.input_hash():
-            return path
+    if is_made_of(path, {"take": take.input_hash()}):
+        return path
     return reconstruct(take, [frame], progress=progress)[0]
 
 

@@ -10,6 +10,7 @@ import pytest
 from capture.product import (
     hash_file,
     is_current,
+    is_made_of,
     record_path,
     replacing,
     stage_record,
@@ -95,3 +96,13 @@ def test_a_product_whose_bytes_changed_is_made_again(tmp_path: Path) -> None:
     assert is_current(product, record)
     record_path(product).write_text("[" * 100_000)
     assert not is_current(product, record)
+
+
+def test_a_product_of_these_inputs_is_known_whatever_its_settings(tmp_path: Path) -> None:
+    product = tmp_path / "scan.ply"
+    product.write_bytes(b"surface")
+    write_record(product, stage_record("recon", None, {"take": "a1", "frame": "0"}))
+    assert is_made_of(product, {"take": "a1"})
+    assert not is_made_of(product, {"take": "b2"})
+    product.write_bytes(b"surf")
+    assert not is_made_of(product, {"take": "a1"})

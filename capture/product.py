@@ -96,7 +96,7 @@ def is_current(product: Path, record: Mapping[str, Any]) -> bool:
 
 
 def is_made_of(product: Path, inputs: Mapping[str, str]) -> bool:
-    """Whether `product` is whole and was made of these inputs, whatever the settings and the code."""
+    """Whether `product` is whole and was made of these inputs, whatever the settings and code."""
     found = _sealed_record(product)
     made_of = {} if found is None else found.get("inputs", {})
     return found is not None and all(made_of.get(key) == inputs[key] for key in inputs)

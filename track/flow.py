@@ -23,7 +23,7 @@ _FLAT = 1e-5  # variance of an image in 0..1 below which a window has no texture
 _MIN_PIXELS = 20
 _MAX_STEP_PX = 1.0
 _DONE_PX = 0.005
-_ALIGNED = 0.85  # correlation at which a sample needs no search: refinement will do
+ALIGNED = 0.85  # correlation at which a sample needs no search: refinement will do
 _FAST = {"reassoc", "contract", "arcp", "nsz"}  # sums may be reordered: they fill vector lanes
 
 
@@ -105,6 +105,16 @@ def refine_flow(
     return FlowMatches(displacement=displacement, correlation=correlation, information=information)
 
 
+def better(one: FlowMatches, other: FlowMatches) -> FlowMatches:
+    """Of two matches of every sample the one that correlates more, the first when alike."""
+    second = other.correlation > one.correlation
+    return FlowMatches(
+        displacement=np.where(second[:, None], other.displacement, one.displacement),
+        correlation=np.where(second, other.correlation, one.correlation),
+        information=np.where(second[:, None], other.information, one.information),
+    )
+
+
 @numba.njit(cache=True, nogil=True)
 def _search(
     reference: Any,
@@ -119,21 +129,21 @@ def _search(
     count, side = len(centres), windows.shape[1]
     best_shift = np.full((count, 2), np.nan)
     best_score = np.full(count, -1.0)
-    patch = np.empty((4, side, _padded(side)), np.float32)
+    patch = np.empty((4, side, padded(side)), np.float32)
     for n in range(count):
         x0, y0 = centres[n, 0] - side // 2, centres[n, 1] - side // 2
         if not chosen[n] or not _inside(image, x0, y0, radius, patch):
             continue
-        if not _template(reference, solid, windows[n], x0, y0, 0, 0, weights, patch):
+        if not template(reference, solid, windows[n], x0, y0, 0, 0, weights, patch):
             continue
-        best_score[n] = _correlation(patch, image, x0, y0)
+        best_score[n] = correlation_at(patch, image, x0, y0)
         if best_score[n] > -1.0:
             best_shift[n] = 0.0
-        if best_score[n] > _ALIGNED:
+        if best_score[n] > ALIGNED:
             continue
         for dy in range(-radius, radius + 1):
             for dx in range(-radius, radius + 1):
-                score = _correlation(patch, image, x0 + dx, y0 + dy)
+                score = correlation_at(patch, image, x0 + dx, y0 + dy)
                 if score > best_score[n]:
                     best_score[n] = score
                     best_shift[n, 0], best_shift[n, 1] = dx, dy
@@ -141,7 +151,7 @@ def _search(
 
 
 @numba.njit(cache=True)
-def _padded(side: int) -> int:
+def padded(side: int) -> int:
     """Columns of a window's row in memory: a multiple of what the processor adds at once."""
     return (side + 7) // 8 * 8
 
@@ -155,7 +165,7 @@ def _inside(image: Any, x0: int, y0: int, margin: int, patch: Any) -> bool:
 
 
 @numba.njit(cache=True, fastmath=_FAST)
-def _correlation(patch: Any, image: Any, x0: int, y0: int) -> float:
+def correlation_at(patch: Any, image: Any, x0: int, y0: int) -> float:
     """Weighted NCC of a template with the image at one whole-pixel place."""
     mean = square = cross = np.float32(0.0)
     for j in range(patch.shape[1]):
@@ -187,7 +197,7 @@ def _refine(
     found = np.full((count, 2), np.nan)
     score = np.full(count, -1.0)
     information = np.zeros((count, 3))
-    width = _padded(side)
+    width = padded(side)
     patch = np.empty((4, side, width), np.float32)  # weight, value, column and row gradient
     scratch = np.empty((side + 3, width), np.float32), np.empty((side, width), np.float32)
     for n in range(count):
@@ -195,9 +205,9 @@ def _refine(
             continue
         x0, y0 = centres[n, 0] - side // 2, centres[n, 1] - side // 2
         ix, iy = int(np.rint(start[n, 0])), int(np.rint(start[n, 1]))
-        if not _template(reference, solid, windows[n], x0, y0, ix, iy, weights, patch):
+        if not template(reference, solid, windows[n], x0, y0, ix, iy, weights, patch):
             continue
-        score[n] = _descend(
+        score[n] = descend(
             image, patch, scratch, (x0, y0), start[n], iterations, found[n], information[n]
         )
         if score[n] <= -1.0:
@@ -206,7 +216,7 @@ def _refine(
 
 
 @numba.njit(cache=True)
-def _descend(
+def descend(
     image: Any,
     patch: Any,
     scratch: Any,
@@ -243,7 +253,7 @@ def _descend(
 
 
 @numba.njit(cache=True)
-def _template(
+def template(
     reference: Any,
     solid: Any,
     window: Any,

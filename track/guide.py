@@ -116,7 +116,7 @@ def _warp(
             place[y, x, 0], place[y, x, 1] = u, v
             if occluders.size > 0 and _hidden(u / scale, v / scale, total, occluders):
                 continue
-            out[y, x] = _interpolated(image, u, v)
+            out[y, x] = interpolated(image, u, v)
             shown[y, x] = 1
     solid = np.zeros((height, width), np.uint8)
     for y in range(1, height - 1):
@@ -127,7 +127,7 @@ def _warp(
 
 
 @numba.njit(cache=True, fastmath={"reassoc", "contract", "nsz"})
-def _interpolated(image: Any, u: float, v: float) -> Any:
+def interpolated(image: Any, u: float, v: float) -> Any:
     """Catmull-Rom interpolation of the sixteen pixels around (u, v)."""
     left, top = int(u), int(v)
     s, t = np.float32(u - left), np.float32(v - top)

@@ -9,6 +9,7 @@ import numba
 import numpy as np
 
 from capture.arrays import Bools, Floats
+from track.beyond import own_slope
 from track.flow import FlowMatches
 from track.guide import GuidedView
 from track.lift import Observations
@@ -47,7 +48,7 @@ def observe(
         believed: (M,) the matches to use.
     """
     offset, information, good = _carry(
-        view.place, level.centres, matches.displacement, matches.correlation,
+        view.place, level.centres, level.windows, matches.displacement, matches.correlation,
         matches.information, believed,
     )  # fmt: skip
     which = level.samples[good]
@@ -71,7 +72,13 @@ def merged(parts: Sequence[Observations]) -> Observations:
 
 @numba.njit(cache=True, nogil=True)
 def _carry(
-    place: Any, centres: Any, displacement: Any, correlation: Any, information: Any, believed: Any
+    place: Any,
+    centres: Any,
+    windows: Any,
+    displacement: Any,
+    correlation: Any,
+    information: Any,
+    believed: Any,
 ) -> tuple[Any, Any, Any]:
     count = len(centres)
     offset = np.zeros((count, 2))
@@ -80,9 +87,7 @@ def _carry(
     for n in range(count):
         if not believed[n]:
             continue
-        x, y = centres[n]
-        ax, ay = _slope(place, x, y, 1, 0)
-        bx, by = _slope(place, x, y, 0, 1)
+        ax, bx, ay, by = own_slope(place, windows[n], centres[n, 0], centres[n, 1])
         area = ax * by - bx * ay
         if not abs(area) > _FOLDED:
             continue
@@ -96,21 +101,3 @@ def _carry(
         out[n, 2] = gain * (q * q * xx + 2.0 * q * s * xy + s * s * yy)
         good[n] = True
     return offset, out, good
-
-
-@numba.njit(cache=True)
-def _slope(place: Any, x: int, y: int, dx: int, dy: int) -> tuple[float, float]:
-    """Derivative of the guide at a pixel along one axis, from the neighbours that it has."""
-    height, width = place.shape[0], place.shape[1]
-    high_x, high_y = min(x + dx, width - 1), min(y + dy, height - 1)
-    low_x, low_y = max(x - dx, 0), max(y - dy, 0)
-    if np.isnan(place[high_y, high_x, 0]):
-        high_x, high_y = x, y
-    if np.isnan(place[low_y, low_x, 0]):
-        low_x, low_y = x, y
-    span = (high_x - low_x) + (high_y - low_y)
-    if span == 0:
-        return np.nan, np.nan
-    across = float(place[high_y, high_x, 0]) - float(place[low_y, low_x, 0])
-    along = float(place[high_y, high_x, 1]) - float(place[low_y, low_x, 1])
-    return across / span, along / span

@@ -8,6 +8,7 @@ of a closed mouth, or a nostril and the cheek behind it, never share a window.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numba
@@ -15,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from capture.arrays import Floats, Floats32, Ints32, check_shape
+from capture.arrays import Bools, Floats, Floats32, Ints32, check_shape
 from capture.camera import Camera
 from recon.mesh import vertex_normals
 from track.raster import RasterBuffers
@@ -48,6 +49,12 @@ class ReferenceLevel:
     samples: Ints32
     centres: Ints32
     windows: Masks
+
+    @cached_property
+    def at_edge(self) -> Bools:
+        """Which samples (M,) have a window that the edge of their piece of surface cuts."""
+        edge: Bools = np.asarray(self.windows.min(axis=(1, 2)) == 0)
+        return edge
 
 
 def visible_samples(

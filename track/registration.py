@@ -9,7 +9,7 @@ are not handed to the next: the last place only says where to look.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -20,7 +20,8 @@ from capture.arrays import Floats, Floats32, Ints, Ints32
 from capture.camera import Camera
 from capture.errors import SettingsError, SolveError
 from recon.surface import Scan
-from track.flow import FlowMatches, refine_flow, search_flow
+from track.beyond import search_beyond
+from track.flow import ALIGNED, FlowMatches, better, refine_flow, search_flow
 from track.guide import GuidedView, guided_view
 from track.laplacian import Constraints, LaplacianDeformer, Stiffness
 from track.lift import Lifted, Observations, triangulate
@@ -31,6 +32,7 @@ from track.reference import ReferenceLevel, facing_normals, reference_level, vis
 from track.rigid import fit_similarity
 from track.scan_depth import ScanDepth, depth_observations
 from track.schedule import Step
+from track.start import blended_start, place_scores
 from track.surface_samples import SurfaceSamples, sample_surface, vertex_rings
 
 _PRIOR_MM = 1.0
@@ -151,6 +153,30 @@ class Registrar:
             constraints, start=rigid.apply(self._neutral), data_weight=10.0, rotation_iterations=3
         )
 
+    def best_start(self, starts: Sequence[Floats], images: Mapping[str, Floats32]) -> Floats:
+        """Where to begin a frame: of several meshes, the one that the images fit, by region.
+
+        Args:
+            starts: (V, 3) each, world mm; the first is kept wherever no other is clearly better.
+            images: the frame's images, float32 mono.
+
+        Returns:
+            (V, 3) world mm.
+        """
+        last = self._levels - 1
+        usable = [name for name in self._views if name in images]
+        coarse = {name: image_pyramid(images[name], self._levels)[last] for name in usable}
+        skins = [self._skin(start) for start in starts]
+
+        def score(name: str) -> Floats:
+            level = self._views[name][last]
+            seen = [guided_view(level, self._triangles, skin, coarse[name]) for skin in skins]
+            return place_scores(level, seen, len(self._samples))
+
+        scores = np.stack(list(self._pool.map(score, usable)), axis=2)
+        supple = self._deformers[min(self._deformers)]
+        return blended_start(starts, scores, self._samples, self._neighbours, supple)
+
     def register(
         self, start: Floats, images: Mapping[str, Floats32], scan: Scan | None = None
     ) -> FrameResult:
@@ -241,7 +267,7 @@ class Registrar:
         def measure(name: str) -> tuple[Observations, Floats]:
             level = self._views[name][step.level]
             view = guided_view(level, self._triangles, skin, images[name], occluders.get(name))
-            matches = self._match(step, level, view)
+            matches = self._match(step, level, view, images[name])
             believed = believable(matches, self._options.min_correlation, step.limit_px)
             seen = observe(level, view, matches, points, believed)
             return seen, matches.correlation[believed]
@@ -276,11 +302,17 @@ class Registrar:
             for name, part in seen.items()
         ]
 
-    def _match(self, step: Step, level: ReferenceLevel, view: GuidedView) -> FlowMatches:
+    def _match(
+        self, step: Step, level: ReferenceLevel, view: GuidedView, image: Floats32
+    ) -> FlowMatches:
         stride = self._options.search_stride if step is self._options.steps[0] else 1
         chosen = level.samples % stride == 0
         found = search_flow(level, view, chosen, step.search_px)
-        return refine_flow(level, view, found.displacement, step.iterations)
+        matches = refine_flow(level, view, found.displacement, step.iterations)
+        lost = chosen & level.at_edge & (matches.correlation < ALIGNED)
+        return better(
+            matches, search_beyond(level, view, image, lost, (step.search_px, step.iterations))
+        )
 
     def _solve(self, step: Step, vertices: Floats, lifted: Lifted) -> tuple[Floats, Floats]:
         weights = lifted.information / (lifted.information + _typical(lifted.information))

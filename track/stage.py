@@ -39,6 +39,7 @@ from track.skin import skin_heights
 
 _FIGURES = ("samples", "correlation", "residual_px", "views", "seconds")
 _MIN_VIEWS = 2
+_SPANNING = 100  # confident vertices from which a motion is told
 _SKIN_LIMIT_MM = 1.0  # a scan farther from the neutral shows something else
 
 
@@ -247,7 +248,8 @@ class _Work:
             registrar = self._made()
             sure = before[-1].confidence.astype(np.float64)
             scan = load_scan(self._scans[frame]) if frame in self._scans else None
-            result = registrar.register(registrar.carried(start, sure), images, scan)
+            starts = [registrar.carried(start, sure), *self._other_starts(start, before)]
+            result = registrar.register(registrar.best_start(starts, images), images, scan)
         figures = {
             "samples": float(result.samples),
             "correlation": result.correlation,
@@ -266,10 +268,24 @@ class _Work:
         if len(before) < 2 or self._settings.extrapolation == 0.0:
             return last
         weights = (before[-1].confidence * before[-2].confidence).astype(np.float64)
-        if (weights > 0).sum() < 100:
+        if (weights > 0).sum() < _SPANNING:
             return last
         earlier = before[-2].vertices.astype(np.float64)
         return damped_motion(earlier, last, weights, self._settings.extrapolation).apply(last)
+
+    def _other_starts(self, start: Floats, before: list[_Tracked]) -> list[Floats]:
+        """Guesses beside the carried mesh: the neutral with the head, and the motion going on."""
+        neutral = self._neutral.vertices.astype(np.float64)
+        sure = before[-1].confidence.astype(np.float64)
+        if (sure > 0).sum() < _SPANNING:
+            return []
+        head = head_motion(neutral, start[None], sure[None]).head_from_neutral[0]
+        out = [neutral @ head[:3, :3].T + head[:3, 3]]
+        weights = sure * before[-2].confidence if len(before) > 1 else np.zeros(len(sure))
+        if (weights > 0).sum() >= _SPANNING:
+            last, earlier = (b.vertices.astype(np.float64) for b in (before[-1], before[-2]))
+            out.append(start + last - damped_motion(earlier, last, weights, 1.0).apply(earlier))
+        return out
 
     def _made(self) -> Registrar:
         if self._registrar is None:

@@ -274,7 +274,7 @@ class _Work:
         return damped_motion(earlier, last, weights, self._settings.extrapolation).apply(last)
 
     def _other_starts(self, start: Floats, before: list[_Tracked]) -> list[Floats]:
-        """Guesses beside the carried mesh: the neutral with the head, and the motion going on."""
+        """Beside the carried mesh: the neutral with the head, and the motion going on."""
         neutral = self._neutral.vertices.astype(np.float64)
         sure = before[-1].confidence.astype(np.float64)
         if (sure > 0).sum() < _SPANNING:

@@ -2,8 +2,8 @@
 
 The last mesh alone is a poor guess for skin that was lost, or that moves fast. Others cost little:
 the neutral, moved with the head, since a face comes back to it; the last mesh with its deformation
-going on. Every guess is judged by what it shows in place against the reference, at the coarsest
-level and without search. So a region that was lost is found again when it returns.
+going on. Every guess is judged by what it shows in place against the reference,
+at the coarsest level and without search. So a region that was lost is found when it returns.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ from track.reference import ReferenceLevel
 from track.surface_samples import SurfaceSamples
 
 _MARGIN = 0.1  # mean correlation by which another guess must beat the first
-_LEAST = 0.3  # mean correlation below which a sample says nothing
+_FITS = 0.6  # mean correlation that another guess must reach: less is chance when none is right
+_UNSURE = 0.1  # weight of samples that fit nowhere: they stay by the first guess
 _MIN_VIEWS = 2
 _ROUNDS = 2  # of averaging over the surface: windows of single samples chance to fit
 _DATA_WEIGHT = 10.0
@@ -66,19 +67,20 @@ def blended_start(
         (V, 3) world mm; the first guess itself when none beats it anywhere.
     """
     fit = _regional(scores, neighbours)
-    rival = np.where(np.arange(len(starts))[:, None] > 0, fit - _MARGIN, fit)
+    rival = np.where(fit > _FITS, fit - _MARGIN, -1.0)
+    rival[0] = fit[0]
     choice: Ints = rival.argmax(axis=0)
-    trust = np.take_along_axis(fit, choice[None], axis=0)[0]
-    if not (choice[trust > _LEAST] > 0).any():
+    if not (choice > 0).any():
         return starts[0]
-    told = np.flatnonzero(trust > _LEAST)
+    trust = np.maximum(np.take_along_axis(fit, choice[None], axis=0)[0] ** 2, _UNSURE)
+    told = np.flatnonzero(fit.any(axis=0))
     chosen = samples.select(told.astype(np.int32))
     places = np.stack([chosen.points(start) for start in starts])
     constraints = Constraints(
         corners=chosen.corners,
         barycentric=chosen.barycentric,
         targets=places[choice[told], np.arange(len(told))],
-        weights=trust[told] ** 2 / np.mean(trust[told] ** 2),
+        weights=trust[told],
     )
     return deformer.solve(
         constraints, start=starts[0], data_weight=_DATA_WEIGHT, rotation_iterations=2

@@ -83,9 +83,18 @@ def write_patch_visit(
     folder: Path, amounts: list[float], seed: int = 0, cameras: CameraArray | None = None
 ) -> tuple[Mesh, Floats]:
     """A visiting take of the patch, with noise of 1.5 DN; returns the mesh and truth (F, V, 3)."""
-    rng = np.random.default_rng(seed)
-    mesh, cameras = patch_mesh(), cameras or patch_array()
+    mesh = patch_mesh()
     truth = np.stack([patch_motion(mesh.vertices, amount) for amount in amounts])
+    write_visit(folder, mesh, truth, seed, cameras)
+    return mesh, truth
+
+
+def write_visit(
+    folder: Path, mesh: Mesh, truth: Floats, seed: int = 0, cameras: CameraArray | None = None
+) -> None:
+    """A visiting take of a textured mesh that moves as `truth` (F, V, 3), with noise of 1.5 DN."""
+    rng = np.random.default_rng(seed)
+    cameras = cameras or patch_array()
     write_cameras(folder / "cameras.json", cameras)
     for camera in cameras:
         (folder / camera.name).mkdir()
@@ -93,7 +102,26 @@ def write_patch_visit(
             grey = 235.0 * picture(camera, mesh, vertices, gain=1.0 - 0.05 * (f % 2))
             noisy = np.clip(np.rint(grey + rng.normal(0, 1.5, grey.shape)), 0, 255)
             cv2.imwrite(str(folder / camera.name / f"{f:04d}.png"), noisy.astype(np.uint8))
-    return mesh, truth
+
+
+def slit_mesh(side: int = 18, half_columns: int = 5) -> tuple[Mesh, Floats]:
+    """The patch cut along the middle of its middle row, as closed lips are.
+
+    Returns:
+        The mesh, and (V,) 1 for vertices below the cut's line (its lower lip included), else 0.
+    """
+    mesh = patch_mesh(side)
+    middle = side // 2
+    columns = np.arange(middle - half_columns + 1, middle + half_columns)
+    lip = middle * (side + 1) + columns
+    twin = np.arange(len(mesh.vertices)).astype(np.int32)
+    twin[lip] = len(mesh.vertices) + np.arange(len(lip))
+    quads = mesh.polygons.copy()
+    under = mesh.vertices[quads].mean(axis=1)[:, 1] < mesh.vertices[lip[0], 1]
+    quads[under] = twin[quads[under]]
+    below = mesh.vertices[:, 1] < mesh.vertices[lip[0], 1] - 1e-6
+    vertices = np.concatenate([mesh.vertices, mesh.vertices[lip]])
+    return Mesh(vertices, quads), np.concatenate([below, np.ones(len(lip))]).astype(float)
 
 
 def write_patch_scan(take: Path, frame: int, mesh: Mesh, vertices: Floats, seed: int = 0) -> Path:

@@ -76,7 +76,7 @@ def _beyond(
         x0, y0 = centres[n, 0] - side // 2, centres[n, 1] - side // 2
         if not chosen[n]:
             continue
-        if not template(reference, solid, windows[n], x0, y0, 0, 0, weights, patch):
+        if not template(reference, solid, windows[n], (x0, y0), (0, 0), weights, patch):
             continue
         slope = own_slope(place, windows[n], centres[n, 0], centres[n, 1])
         if not _extended(place, windows[n], x0 - margin, y0 - margin, margin, slope, around):
@@ -91,7 +91,7 @@ def _beyond(
                     best = here
                     shift[0], shift[1] = dx, dy
         score[n] = descend(
-            shown, patch, scratch, (margin, margin), shift, iterations, found[n], information[n]
+            shown, patch, scratch, (margin, margin), shift, iterations, (found[n], information[n])
         )
         if score[n] <= -1.0:
             found[n] = np.nan

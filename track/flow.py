@@ -134,7 +134,7 @@ def _search(
         x0, y0 = centres[n, 0] - side // 2, centres[n, 1] - side // 2
         if not chosen[n] or not _inside(image, x0, y0, radius, patch):
             continue
-        if not template(reference, solid, windows[n], x0, y0, 0, 0, weights, patch):
+        if not template(reference, solid, windows[n], (x0, y0), (0, 0), weights, patch):
             continue
         best_score[n] = correlation_at(patch, image, x0, y0)
         if best_score[n] > -1.0:
@@ -205,10 +205,10 @@ def _refine(
             continue
         x0, y0 = centres[n, 0] - side // 2, centres[n, 1] - side // 2
         ix, iy = int(np.rint(start[n, 0])), int(np.rint(start[n, 1]))
-        if not template(reference, solid, windows[n], x0, y0, ix, iy, weights, patch):
+        if not template(reference, solid, windows[n], (x0, y0), (ix, iy), weights, patch):
             continue
         score[n] = descend(
-            image, patch, scratch, (x0, y0), start[n], iterations, found[n], information[n]
+            image, patch, scratch, (x0, y0), start[n], iterations, (found[n], information[n])
         )
         if score[n] <= -1.0:
             found[n] = np.nan
@@ -217,16 +217,10 @@ def _refine(
 
 @numba.njit(cache=True)
 def descend(
-    image: Any,
-    patch: Any,
-    scratch: Any,
-    corner: Any,
-    start: Any,
-    iterations: int,
-    found: Any,
-    information: Any,
+    image: Any, patch: Any, scratch: Any, corner: Any, start: Any, iterations: int, out: Any
 ) -> float:
-    """Gauss-Newton from `start`; fills `found` and `information` and returns the NCC."""
+    """Gauss-Newton from `start`; fills displacement and information, returns the NCC."""
+    found, information = out
     lines, values = scratch
     xx, xy, yy = _hessian(patch)
     determinant = xx * yy - xy * xy
@@ -254,18 +248,11 @@ def descend(
 
 @numba.njit(cache=True)
 def template(
-    reference: Any,
-    solid: Any,
-    window: Any,
-    x0: int,
-    y0: int,
-    ix: int,
-    iy: int,
-    weights: Any,
-    patch: Any,
+    reference: Any, solid: Any, window: Any, corner: Any, shift: Any, weights: Any, patch: Any
 ) -> bool:
     """Normalised reference window and its steepest descent images; False without texture."""
     image, gradient = reference
+    (x0, y0), (ix, iy) = corner, shift
     height, width = image.shape
     side = window.shape[0]
     total = mean = 0.0

@@ -31,9 +31,11 @@ from recon.images import mono
 from recon.mesh import Mesh
 from recon.scan import load_scan
 from track.head_motion import damped_motion, head_motion
+from track.landmark_file import Landmarks, read_landmarks
 from track.performance import Performance, read_performance, write_performance
 from track.pyramid import level_count
 from track.registration import FrameResult, Registrar, RegistrarOptions
+from track.rigid import fit_similarity
 from track.schedule import schedule
 from track.skin import skin_heights
 
@@ -110,8 +112,8 @@ def track(
         take: it needs cameras.
         neutral: world mm, on the skin at the first frame; any topology.
         settings: see `TrackSettings`.
-        landmarks: hand landmarks; the registered neutral makes them unnecessary here. The file
-            must be JSON; nothing else is done with it.
+        landmarks: hand marks of the first frame, three or more; see docs/neutral.md. The neutral
+            is moved rigidly onto them first: for a take whose head is not where the neutral is.
         progress: told after each frame.
 
     Returns:
@@ -121,13 +123,16 @@ def track(
     Raises:
         CameraError: when the take has no cameras, or they do not fit.
         TakeError: when the take has no frames, too few views of the first one, or no view sees
-            the neutral; or when the landmarks cannot be read.
+            the neutral; or when the landmarks cannot be read, or are fewer than three.
         SolveError: when a solve does not reach an answer.
     """
     out = take.products / "track" / "performance.npz"
     frames = _frames(take)
     scans = _scans(take) if settings.use_scan else {}
-    records = _records(settings, _inputs(take, neutral, landmarks), frames, scans)
+    if landmarks is not None:
+        marks = read_landmarks(landmarks, len(neutral.vertices), take.cameras())
+        neutral = _laid_on(neutral, marks, landmarks)
+    records = _records(settings, _inputs(take, neutral), frames, scans)
     record = records[frames[-1]]
     if is_current(out, record):
         return read_performance(out)
@@ -352,18 +357,18 @@ def _scans(take: Take) -> dict[int, Path]:
     return {frame: path for frame, path in paths.items() if path.is_file()}
 
 
-def _inputs(take: Take, neutral: Mesh, landmarks: Path | None) -> dict[str, str]:
+def _inputs(take: Take, neutral: Mesh) -> dict[str, str]:
     """Hashes of what every frame is made from."""
     shape = hashlib.sha256(neutral.vertices.tobytes() + neutral.polygons.tobytes()).hexdigest()
-    inputs = {"take": take.input_hash(), "neutral": shape}
-    if landmarks is not None:
-        try:
-            text = Path(landmarks).read_text(encoding="utf-8")
-            json.loads(text)
-        except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-            raise TakeError(f"{landmarks}: expected landmarks as JSON: {error}") from error
-        inputs["landmarks"] = hashlib.sha256(text.encode()).hexdigest()
-    return inputs
+    return {"take": take.input_hash(), "neutral": shape}
+
+
+def _laid_on(neutral: Mesh, marks: Landmarks, path: Path) -> Mesh:
+    """The neutral moved rigidly onto marks of the first frame."""
+    if len(marks.vertices) < 3:
+        raise TakeError(f"{path}: placing the neutral needs 3 marks, found {len(marks.vertices)}")
+    motion = fit_similarity(neutral.vertices[marks.vertices], marks.positions)
+    return neutral.with_vertices(motion.apply(neutral.vertices))
 
 
 def _records(

@@ -8,6 +8,7 @@ import pytest
 
 from capture.arrays import Floats
 from capture.errors import CameraError, SettingsError, TakeError
+from capture.pose import Pose
 from capture.take import Take
 from recon.mesh import Mesh
 from recon.visiting import import_take
@@ -119,14 +120,35 @@ def test_a_take_without_cameras_is_refused(
         track(take, mesh, TrackSettings())
 
 
+def test_landmarks_lay_a_neutral_from_elsewhere_onto_the_first_frame(
+    visit: tuple[Path, Mesh, Floats], tmp_path: Path
+) -> None:
+    folder, mesh, truth = visit
+    take = _take(folder, tmp_path / "take")
+    away = Pose.from_rotation_vector(np.array([0.2, -0.3, 0.1]), np.array([30.0, -20.0, 15.0]))
+    elsewhere = mesh.with_vertices(away.apply(mesh.vertices))
+    marks = tmp_path / "marks.json"
+    points = [
+        {"vertex": vertex, "position_mm": mesh.vertices[vertex].tolist()}
+        for vertex in (22, 60, 300)
+    ]
+    marks.write_text(json.dumps({"space": "world", "points": points}), encoding="utf-8")
+    performance = track(take, elsewhere, TrackSettings(), landmarks=marks)
+    error = _error(performance.vertices.astype(float), truth)
+    assert np.sqrt((error**2).mean()) < 0.06
+    marks.write_text(json.dumps({"space": "world", "points": points[:2]}), encoding="utf-8")
+    with pytest.raises(TakeError, match=r"marks\.json: placing the neutral needs 3 marks, found 2"):
+        track(take, elsewhere, TrackSettings(), landmarks=marks)
+
+
 def test_landmarks_that_are_not_json_are_refused(
     visit: tuple[Path, Mesh, Floats], tmp_path: Path
 ) -> None:
     folder, mesh, _ = visit
-    take = _take(folder, tmp_path / "take")
     marks = tmp_path / "marks.json"
-    marks.write_text("{")
-    with pytest.raises(TakeError, match=r"marks\.json: expected landmarks as JSON"):
+    marks.write_text("{", encoding="utf-8")
+    take = _take(folder, tmp_path / "take")
+    with pytest.raises(TakeError, match=r"marks\.json: not readable as JSON"):
         track(take, mesh, TrackSettings(), landmarks=marks)
 
 

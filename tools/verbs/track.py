@@ -30,7 +30,7 @@ class Arguments(Options):
     neutral: Path
     """The neutral in tracking topology, registered to the first frame, OBJ, world mm."""
     landmarks: Path | None = None
-    """Landmarks, JSON; see docs/tracking.md."""
+    """Hand marks of the first frame, JSON: the neutral is laid rigidly onto them."""
     settings: Annotated[TrackSettings, tyro.conf.arg(name="")] = field(
         default_factory=TrackSettings
     )

@@ -23,7 +23,7 @@ _DAMAGE = (
     zipfile.BadZipFile, zlib.error, struct.error,
 )  # fmt: skip
 _LARGEST_BYTES = 16 << 30  # of one array: a few kilobytes of zip can claim any size
-_TEXT = "names"  # the one key of any archive of ours that holds text
+_TEXT = "names"  # keys that end so hold text
 _NPY_MARK = b"\x93NUMPY"
 _EPOCH = (1980, 1, 1, 0, 0, 0)  # zip entries carry a time: a fixed one keeps bytes equal
 
@@ -37,7 +37,7 @@ def read_archive(
 ) -> dict[str, NDArray[Any]]:
     """Read the named arrays of an `.npz`; other arrays in it are left alone.
 
-    Only `names` may hold text; all others hold real numbers.
+    Keys that end in `names` hold text; all others hold real numbers.
 
     Args:
         path: the file.
@@ -98,8 +98,9 @@ def _read_keys(
             raise ShapeError(f"{path}: {key} cannot be read: {error}") from error
         if not isinstance(array, np.ndarray):
             raise ShapeError(f"{path}: {key} cannot be read: it is not an array")
-        if array.dtype.kind not in ("U" if key == _TEXT else "iufb"):
-            wanted = "text" if key == _TEXT else "real numbers"
+        text = key.endswith(_TEXT)
+        if array.dtype.kind not in ("U" if text else "iufb"):
+            wanted = "text" if text else "real numbers"
             raise ShapeError(f"{path}: {key} must hold {wanted}, found {array.dtype}")
         out[key] = array
     return out

@@ -153,11 +153,15 @@ class Registrar:
             constraints, start=rigid.apply(self._neutral), data_weight=10.0, rotation_iterations=3
         )
 
-    def best_start(self, starts: Sequence[Floats], images: Mapping[str, Floats32]) -> Floats:
+    def best_start(
+        self, starts: Sequence[Floats], confidence: Floats, images: Mapping[str, Floats32]
+    ) -> Floats:
         """Where to begin a frame: of several meshes, the one that the images fit, by region.
 
         Args:
-            starts: (V, 3) each, world mm; the first is kept wherever no other is clearly better.
+            starts: (V, 3) each, world mm; the first is kept wherever no other is clearly better,
+                and wherever the last frame was sure.
+            confidence: (V,) of the last frame, 0..1.
             images: the frame's images, float32 mono.
 
         Returns:
@@ -174,6 +178,8 @@ class Registrar:
             return place_scores(level, seen, len(self._samples))
 
         scores = np.stack(list(self._pool.map(score, usable)), axis=2)
+        sure = (confidence[self._samples.corners] * self._samples.barycentric).sum(axis=1) > _SURE
+        scores[1:, sure] = np.nan
         supple = self._deformers[min(self._deformers)]
         return blended_start(starts, scores, self._samples, self._neighbours, supple)
 

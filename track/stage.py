@@ -254,7 +254,7 @@ class _Work:
             sure = before[-1].confidence.astype(np.float64)
             scan = load_scan(self._scans[frame]) if frame in self._scans else None
             starts = [registrar.carried(start, sure), *self._other_starts(start, before)]
-            result = registrar.register(registrar.best_start(starts, images), images, scan)
+            result = registrar.register(registrar.best_start(starts, sure, images), images, scan)
         figures = {
             "samples": float(result.samples),
             "correlation": result.correlation,

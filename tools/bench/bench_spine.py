@@ -33,6 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory() as scratch:
         folder = options.out if options.out is not None else Path(scratch)
+        folder.mkdir(parents=True, exist_ok=True)
         template = folder / "template.npz"
         source = options.shared / "data" / "ict" / "ict_light.npz"
         _run([sys.executable, "-m", "tools.make_template", "ict", str(source), str(template)])

@@ -69,7 +69,7 @@ class TrackSettings:
     """
 
     spacing_mm: float = 6.0
-    search_mm: float = 7.0
+    search_mm: float = 12.0
     passes: int = 2
     half_window_px: int = 6
     half_window_coarse_px: int = 4

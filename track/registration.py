@@ -37,6 +37,7 @@ from track.surface_samples import SurfaceSamples, sample_surface, vertex_rings
 
 _PRIOR_MM = 1.0
 _SURE = 0.25  # confidence from which a vertex carries its neighbours into the next frame
+_HELD = 0.8  # confidence from which skin is not looked for elsewhere in the next frame
 _SINGLE_VIEW = 0.02  # weight of a sample that one view alone sees, and no scan: of unknown depth
 _AGREED = 2  # witnesses, views or a view and the scan, that fix a sample's place
 _FEW = 2  # a sample that no more views than this see gets its depth from the scan too
@@ -178,7 +179,7 @@ class Registrar:
             return place_scores(level, seen, len(self._samples))
 
         scores = np.stack(list(self._pool.map(score, usable)), axis=2)
-        sure = (confidence[self._samples.corners] * self._samples.barycentric).sum(axis=1) > _SURE
+        sure = (confidence[self._samples.corners] * self._samples.barycentric).sum(axis=1) > _HELD
         scores[1:, sure] = np.nan
         supple = self._deformers[min(self._deformers)]
         return blended_start(starts, scores, self._samples, self._neighbours, supple)

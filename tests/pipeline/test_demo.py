@@ -13,7 +13,7 @@ from rig.face_rig import read_rig
 from tools.demo import run_demo
 from tools.demo_session import EXPRESSIONS, DemoSettings
 
-SMALL = DemoSettings(size_px=320, board_frames=12, expression_frames=5)
+SMALL = DemoSettings(size_px=320, board_frames=12, expression_frames=9)
 
 
 @pytest.mark.slow

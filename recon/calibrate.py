@@ -60,7 +60,7 @@ def calibrate(
     _write_report(report_path(out), report)
     write_cameras(out, solution.state.cameras, summary_of(report))
     write_record(out, record)
-    return solution.state.cameras
+    return read_cameras(out)  # as a second run finds them
 
 
 def report_path(cameras: Path) -> Path:

@@ -158,11 +158,10 @@ def solve_rig(
     report |= {"neutral_frame": frame, "seconds": round(time.monotonic() - started, 3)}
     report["best_fit"] = _best_fit(seen, first, fit)
     report["topology_matches"] = _same_topology(template, performances)
-    rig = _whole_rig(template, moving, fit)
     write_report(Path(out) / "report.json", report)
-    write_rig(product, rig)
+    write_rig(product, _whole_rig(template, moving, fit))
     write_record(product, record)
-    return rig
+    return read_rig(product)  # as a second run finds it
 
 
 def check_match(

@@ -126,7 +126,7 @@ def register_neutral(
         progress: told after each step.
 
     Returns:
-        The registered mesh.
+        The registered mesh, as `out` holds it.
 
     Raises:
         TakeError: when the template is empty or not in mm, or the landmarks do not fit.
@@ -156,7 +156,7 @@ def register_neutral(
     write_archive(out.with_suffix(".residual.npz"), {"residual_mm": residual})
     write_obj(out, mesh)
     write_record(out, record)
-    return mesh
+    return read_obj(out)  # as a second run finds it: what is made of it is then current
 
 
 def fit_template(

@@ -5,27 +5,41 @@ from __future__ import annotations
 import json
 import os
 import time
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from concurrent.futures import Future
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
 from capture.arrays import Image
 from capture.camera import CameraArray
-from capture.errors import SolveError, TakeError
-from capture.product import is_current, replacing, stage_record, write_record
+from capture.errors import (
+    InputError,
+    LikenessError,
+    SettingsError,
+    SolveError,
+    TakeError,
+    raise_all,
+)
+from capture.product import hash_file, is_current, replacing, stage_record, write_record
 from capture.progress import Progress, silent
 from capture.settings import check_range
 from capture.take import Take
+from recon.depth_maps import write_depth_maps
 from recon.disparity import DisparitySettings, Reason
 from recon.fusion import FusionSettings, Points, fuse
+from recon.mesh_process import Mesher
 from recon.pairs import PairSettings
+from recon.point_file import is_points_file, points_scan
+from recon.prior import PriorMesh, PriorMeshes
 from recon.stereo import PairDepth, StereoSettings, match_views
 from recon.surface import Scan, SurfaceSettings, poisson_scan, read_ply, write_ply
 
 _Value = TypeVar("_Value")
+_TOLD = 20  # failed frames named in one message
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,7 +62,12 @@ class ReconSettings:
         voxel_px: points are averaged in voxels of this many pixel footprints.
         cell_spacings: finest Poisson cell, in point spacings.
         evidence_spacings: surface farther than this from every point is cut away.
+        prior_mm: with a prior mesh, how far from it the surface is looked for.
+        mesh: make a mesh; without, the oriented points are the product.
+        depth_maps: also write the depth map of the mesh in each camera.
         workers: threads; 0 takes one a processor. The result does not depend on it.
+        frames_at_once: frames in the making: one is matched while others are meshed, each in a
+            process of its own. The result does not depend on it.
     """
 
     centre_mm: tuple[float, float, float] | None = None
@@ -66,10 +85,21 @@ class ReconSettings:
     voxel_px: float = 1.2
     cell_spacings: float = 2.2
     evidence_spacings: float = 2.5
+    prior_mm: float = 8.0
+    mesh: bool = True
+    depth_maps: bool = False
     workers: int = 0
+    frames_at_once: int = 2
 
     def __post_init__(self) -> None:
         check_range("recon.workers", self.workers, 0, 1024)
+        check_range("recon.frames_at_once", self.frames_at_once, 1, 64)
+        check_range("recon.prior_mm", self.prior_mm, 0.1, 1000.0)
+        if self.depth_maps and not self.mesh:
+            raise SettingsError(
+                "recon.depth_maps = True with recon.mesh = False: depth maps are rendered from "
+                "the mesh; ask for both or for neither"
+            )
         # The parts check their own ranges.
         self.stereo()
         self.fusion()
@@ -115,7 +145,7 @@ class FrameScan:
     """One instant reconstructed.
 
     Attributes:
-        scan: the mesh, world mm.
+        scan: the mesh, world mm; without triangles, the points, when no mesh was asked for.
         points: the oriented points under it.
         report: numbers of how it went, fit for JSON.
     """
@@ -130,27 +160,31 @@ def reconstruct(
     frames: Sequence[int],
     settings: ReconSettings | None = None,
     *,
+    prior: PriorMeshes | None = None,
     progress: Progress = silent,
 ) -> list[Path]:
     """Reconstruct the surface at some frames of a take, a mesh and a page of numbers for each.
 
-    Writes `TAKE/products/recon/frame_0000.ply`, `frame_0000.json` and a record; a frame whose
-    record is current is skipped, so that an interrupted run goes on where it stopped. Views lost
-    by the capture are left out and named in the numbers.
+    Writes `TAKE/products/recon/frame_0000.ply` (without `settings.mesh`: `points_0000.ply`), a
+    JSON of the same name and a record; a frame whose record is current is skipped, so that an
+    interrupted run goes on where it stopped. Views lost by the capture are left out and named in
+    the numbers. A frame that fails does not stop the others.
 
     Args:
         take: a take with cameras.
         frames: frame numbers.
         settings: None takes the defaults.
+        prior: where the surface was about then, to look near to; None looks everywhere.
         progress: told after each frame.
 
     Returns:
-        The meshes' paths, in the order of `frames`.
+        The meshes' (or points') paths, in the order of `frames`.
 
     Raises:
         CameraError: when the take has no cameras, or no two of them can be paired.
         TakeError: when a frame is not in the take, or fewer than two views of it are.
-        SolveError: when no surface is found.
+        SolveError: when no surface is found; or, after all frames were tried, naming those of
+            several that failed.
     """
     settings = settings or ReconSettings()
     cameras = take.cameras()
@@ -159,21 +193,17 @@ def reconstruct(
         raise TakeError(
             f"{take.folder}: asked for frames {unknown}, the take has 0 to {len(take.frames) - 1}"
         )
-    inputs = take.input_hash()
-    paths = []
-    for done, frame in enumerate(frames):
-        path = take.products / "recon" / f"frame_{frame:04d}.ply"
-        record = stage_record("recon", settings, {"take": inputs})
-        if not is_current(path, record):
-            _reconstruct_one(take, cameras, frame, settings, path)
-            write_record(path, record)
-        paths.append(path)
-        progress(done + 1, len(frames), "recon")
-    return paths
+    run = _Run(take, cameras, settings, prior, tuple(dict.fromkeys(frames)), progress)
+    run.go()
+    return [run.path(frame) for frame in frames]
 
 
 def reconstruct_images(
-    cameras: CameraArray, images: Mapping[str, Image], settings: ReconSettings | None = None
+    cameras: CameraArray,
+    images: Mapping[str, Image],
+    settings: ReconSettings | None = None,
+    *,
+    prior: PriorMesh | None = None,
 ) -> FrameScan:
     """Reconstruct the surface that the images of one instant show.
 
@@ -181,17 +211,189 @@ def reconstruct_images(
         cameras: the array; cameras without an image are left out.
         images: by camera name, (H, W) or (H, W, 3), uint8, uint16 or float in 0..1.
         settings: None takes the defaults.
+        prior: where the surface is expected; None looks everywhere.
 
     Raises:
         CameraError: when fewer than two cameras have an image, or no two can be paired.
         SolveError: when no surface is found.
     """
     settings = settings or ReconSettings()
+    points, report = _matched(cameras, images, settings, prior)
+    seconds = report["seconds"]
+    if settings.mesh:
+        scan = _timed(seconds, "mesh", lambda: poisson_scan(points, settings.surface()))
+    else:
+        scan = points_scan(points)
+    sizes = {"vertices": len(scan.vertices), "triangles": len(scan.triangles)}
+    return FrameScan(scan, points, {**report, **sizes})
+
+
+def load_scan(path: Path) -> Scan:
+    """Read the scan of one frame: vertices, triangles, normals and confidence.
+
+    Raises:
+        TakeError: when there is none, or it is no mesh.
+    """
+    if is_points_file(path):
+        raise TakeError(
+            f"{path}: holds points without faces; run `likeness recon` with a mesh "
+            "(mesh = true in [recon])"
+        )
+    return read_ply(path)
+
+
+class _Waiting(NamedTuple):
+    """A frame that is matched and not written yet."""
+
+    frame: int
+    points: Points
+    report: dict[str, Any]
+    scan: Future[Scan] | None
+
+
+class _Run:
+    """The frames of one call: matched one after the other, meshed beside that, then written."""
+
+    def __init__(
+        self,
+        take: Take,
+        cameras: CameraArray,
+        settings: ReconSettings,
+        prior: PriorMeshes | None,
+        frames: tuple[int, ...],
+        progress: Progress,
+    ) -> None:
+        self._take, self._cameras, self._settings = take, cameras, settings
+        self._prior, self._frames, self._progress = prior, frames, progress
+        self._inputs = {"take": take.input_hash()}
+        self._failed: dict[int, LikenessError] = {}
+        self._waiting: deque[_Waiting] = deque()
+        self._done = 0
+
+    def go(self) -> None:
+        """Make what is not current; then raise one error for all frames that failed."""
+        todo = []
+        for frame in self._frames:
+            if is_current(self.path(frame), self._record(frame)):
+                self._add_depth_maps(frame)
+                self._tell()
+            else:
+                todo.append(frame)
+        beside = max(min(self._settings.frames_at_once, len(todo)) - 1, 0)
+        with Mesher(self._settings.surface(), beside if self._settings.mesh else 0) as mesher:
+            for frame in todo:
+                self._start(frame, mesher)
+                while len(self._waiting) > beside:
+                    self._finish()
+            while self._waiting:
+                self._finish()
+        self._raise_failed()
+
+    def path(self, frame: int) -> Path:
+        """Where the mesh, or the points, of a frame stand."""
+        kind = "frame" if self._settings.mesh else "points"
+        return self._take.products / "recon" / f"{kind}_{frame:04d}.ply"
+
+    def _start(self, frame: int, mesher: Mesher) -> None:
+        """Match a frame and have it meshed."""
+        take = self._take
+        names = [name for name in take.device_names if take.present(name, frame)]
+        missing = [name for name in take.device_names if name not in names]
+        try:
+            if len(names) < 2:
+                raise TakeError(
+                    f"{take.folder}: frame {frame} has {len(names)} views; stereo needs at "
+                    f"least 2; lost: {', '.join(missing)}"
+                )
+            images = {name: take.image(name, frame) for name in names}
+            expected = self._prior.at(frame, self._settings.prior_mm) if self._prior else None
+            points, report = _matched(self._cameras, images, self._settings, expected)
+        except (SolveError, InputError) as error:
+            self._fail(frame, error)
+            return
+        report = {"frame": frame, "missing": missing, **report}
+        scan = mesher.submit(points) if self._settings.mesh else None
+        self._waiting.append(_Waiting(frame, points, report, scan))
+
+    def _finish(self) -> None:
+        """Write the frame that was started first."""
+        frame, points, report, meshed = self._waiting.popleft()
+        try:
+            scan = points_scan(points) if meshed is None else meshed.result()
+        except SolveError as error:
+            self._fail(frame, error)
+            return
+        report["vertices"], report["triangles"] = len(scan.vertices), len(scan.triangles)
+        path = self.path(frame)
+        with replacing(path.with_suffix(".json")) as partial:
+            partial.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+        write_ply(path, scan)
+        write_record(path, self._record(frame))
+        self._add_depth_maps(frame)
+        self._tell()
+
+    def _add_depth_maps(self, frame: int) -> None:
+        """Render the depth maps of a finished frame, unless they are there."""
+        if not self._settings.depth_maps:
+            return
+        path = self.path(frame)
+        out = path.parent / "depth" / f"{path.stem}.npz"
+        record = stage_record("depth_maps", self._settings.surface(), {"scan": hash_file(path)})
+        if not is_current(out, record):
+            scan = read_ply(path)
+            write_depth_maps(out, self._cameras, scan.vertices, scan.triangles)
+            write_record(out, record)
+
+    def _record(self, frame: int) -> dict[str, Any]:
+        """What makes a frame what it is; not what only changes how fast it is made."""
+        plain = replace(self._settings, depth_maps=False, workers=0, frames_at_once=1)
+        inputs = dict(self._inputs)
+        digest = "none" if self._prior is None else self._prior.digest(frame)
+        if digest != "none":
+            inputs["prior"] = digest
+        return stage_record("recon", plain, inputs)
+
+    def _fail(self, frame: int, error: LikenessError) -> None:
+        self._failed[frame] = error
+        self._tell()
+
+    def _tell(self) -> None:
+        self._done += 1
+        self._progress(self._done, len(self._frames), "recon")
+
+    def _raise_failed(self) -> None:
+        if not self._failed:
+            return
+        count = len(self._failed)
+        if count == 1 and len(self._frames) == 1:
+            raise next(iter(self._failed.values()))
+        problems = [f"frame {frame}: {error}" for frame, error in sorted(self._failed.items())]
+        kinds = [type(e) for e in self._failed.values() if isinstance(e, InputError)]
+        if len(kinds) == len(self._frames):
+            raise_all(str(self._take.folder), problems, kinds[0])
+        told = [*problems[:_TOLD], *([f"and {count - _TOLD} more"] if count > _TOLD else [])]
+        lines = "\n".join(f"  - {problem}" for problem in told)
+        raise SolveError(
+            f"{self._take.folder}: {count} of {len(self._frames)} frames failed, the others are "
+            f"done:\n{lines}"
+        )
+
+
+def _matched(
+    cameras: CameraArray,
+    images: Mapping[str, Image],
+    settings: ReconSettings,
+    prior: PriorMesh | None,
+) -> tuple[Points, dict[str, Any]]:
+    """Oriented points of one instant, and numbers of how they came about."""
     workers = settings.workers or os.cpu_count() or 1
     there = CameraArray(tuple(camera for camera in cameras if camera.name in images))
     seconds: dict[str, float] = {}
+    near: dict[str, Any] = {} if prior is None else {"prior": prior}
     pairs = _timed(
-        seconds, "match", lambda: match_views(there, images, settings.stereo(), workers=workers)
+        seconds,
+        "match",
+        lambda: match_views(there, images, settings.stereo(), workers=workers, **near),
     )
     views = [pair.view for pair in pairs if pair.view is not None]
     if not views:
@@ -202,38 +404,8 @@ def reconstruct_images(
             f"nothing found: {len(points)} points are seen alike by {len(pairs)} pairs; "
             "are the cameras those of this take?"
         )
-    scan = _timed(seconds, "mesh", lambda: poisson_scan(points, settings.surface()))
-    return FrameScan(scan, points, _numbers(there, pairs, points, scan, seconds))
-
-
-def load_scan(path: Path) -> Scan:
-    """Read the scan of one frame: vertices, triangles, normals and confidence.
-
-    Raises:
-        TakeError: when there is none, or it is no mesh.
-    """
-    return read_ply(path)
-
-
-def _reconstruct_one(
-    take: Take, cameras: CameraArray, frame: int, settings: ReconSettings, path: Path
-) -> None:
-    names = [name for name in take.device_names if take.present(name, frame)]
-    missing = [name for name in take.device_names if name not in names]
-    if len(names) < 2:
-        raise TakeError(
-            f"{take.folder}: frame {frame} has {len(names)} views; stereo needs at least 2; "
-            f"lost: {', '.join(missing)}"
-        )
-    images = {name: take.image(name, frame) for name in names}
-    try:
-        result = reconstruct_images(cameras, images, settings)
-    except SolveError as error:
-        raise SolveError(f"{take.folder}: frame {frame}: {error}") from error
-    report = {"frame": frame, "missing": missing, **result.report}
-    with replacing(path.with_suffix(".json")) as partial:
-        partial.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
-    write_ply(path, result.scan)
+    report = _numbers(there, pairs, points)
+    return points, {**report, "seconds": seconds}
 
 
 def _timed(seconds: dict[str, float], name: str, work: Callable[[], _Value]) -> _Value:
@@ -247,8 +419,6 @@ def _numbers(
     cameras: CameraArray,
     pairs: Sequence[PairDepth],
     points: Points,
-    scan: Scan,
-    seconds: Mapping[str, float],
 ) -> dict[str, Any]:
     """What a reader wants to know of a scan, fit for JSON."""
     reasons = {
@@ -273,7 +443,4 @@ def _numbers(
         "agreement_median_mm": round(points.agreement_mm[0], 4),
         "agreement_p95_mm": round(points.agreement_mm[1], 4),
         "support_median": float(np.median(points.support)),
-        "vertices": len(scan.vertices),
-        "triangles": len(scan.triangles),
-        "seconds": dict(seconds),
     }

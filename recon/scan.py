@@ -366,7 +366,10 @@ class _Run:
             return
         count = len(self._failed)
         if count == 1 and len(self._frames) == 1:
-            raise next(iter(self._failed.values()))
+            ((frame, error),) = self._failed.items()
+            if isinstance(error, InputError):
+                raise error
+            raise SolveError(f"{self._take.folder}: frame {frame}: {error}") from error
         problems = [f"frame {frame}: {error}" for frame, error in sorted(self._failed.items())]
         kinds = [type(e) for e in self._failed.values() if isinstance(e, InputError)]
         if len(kinds) == len(self._frames):

@@ -3,6 +3,8 @@
 import json
 import subprocess
 import sys
+import time
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -12,6 +14,8 @@ import pytest
 from capture.camera import CameraArray
 from capture.camera_file import write_cameras
 from capture.errors import CameraError, SettingsError, SolveError, TakeError
+from recon.depth_maps import depth_map, read_depth_maps
+from recon.point_file import read_points
 from recon.scan import ReconSettings, load_scan, reconstruct, reconstruct_images
 from recon.surface import SurfaceQuery
 from recon.visiting import import_take
@@ -25,6 +29,11 @@ SMALL = ReconSettings(depth_mm=90.0, extent_mm=110.0)
 @pytest.fixture(scope="module")
 def images() -> dict[str, np.ndarray]:
     return {c.name: np.rint(65535 * draw(c)).astype(np.uint16) for c in ARRAY}
+
+
+@pytest.fixture(scope="module")
+def few(images) -> dict[str, np.ndarray]:
+    return {name: images[name] for name in ("cam01", "cam02", "cam04", "cam05")}
 
 
 @pytest.fixture(scope="module")
@@ -126,6 +135,101 @@ def test_a_missing_scan_names_the_verb(tmp_path):
         load_scan(tmp_path / "frame_0000.ply")
 
 
+def test_frames_beside_each_other_are_the_same_to_the_byte(tmp_path, few):
+    other = {name: np.roll(image, 3, axis=0) for name, image in few.items()}
+    shelves = []
+    for at_once in (1, 3):
+        take = import_take(_visit(tmp_path / str(at_once), few, other), tmp_path / f"t{at_once}")
+        told: list[int] = []
+        reconstruct(
+            take,
+            [1, 0],
+            replace(SMALL, frames_at_once=at_once),
+            progress=lambda done, total, what, told=told: told.append(done),
+        )
+        assert told == [1, 2]
+        shelves.append(_shelf(take.products / "recon"))
+    assert len(shelves[0]) == 6
+    assert shelves[0] == shelves[1]
+
+
+def test_a_bad_frame_does_not_stop_the_others(tmp_path, few):
+    flat = {name: np.full((200, 200), 9, np.uint16) for name in few}
+    take = import_take(_visit(tmp_path, few, flat, few), tmp_path / "take")
+    settings = replace(SMALL, frames_at_once=2)
+    told: list[int] = []
+    with pytest.raises(SolveError, match=r"(?s)1 of 3 frames failed.*frame 1: nothing found"):
+        reconstruct(take, [0, 1, 2], settings, progress=lambda done, total, what: told.append(done))
+    assert told == [1, 2, 3]
+    folder = take.products / "recon"
+    assert sorted(path.name for path in folder.glob("*.ply")) == [
+        "frame_0000.ply",
+        "frame_0002.ply",
+    ]
+    stamp = (folder / "frame_0002.ply").stat().st_mtime_ns
+    with pytest.raises(SolveError, match=r"frame 1: nothing found"):
+        reconstruct(take, [1, 2], settings)
+    assert (folder / "frame_0002.ply").stat().st_mtime_ns == stamp
+    with pytest.raises(SolveError, match=r"frame 1: nothing found"):
+        reconstruct(take, [1], settings)
+
+
+def test_an_interrupt_keeps_what_is_finished_and_leaves_nothing_half_written(tmp_path, few):
+    take = import_take(_visit(tmp_path, few, few, few), tmp_path / "take")
+
+    def stop(done: int, total: int, what: str) -> None:
+        raise KeyboardInterrupt
+
+    start = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        reconstruct(take, [0, 1, 2], replace(SMALL, frames_at_once=2), progress=stop)
+    assert time.monotonic() - start < 60
+    names = sorted(path.name for path in (take.products / "recon").iterdir())
+    assert names == ["frame_0000.json", "frame_0000.ply", "frame_0000.ply.record.json"]
+    told: list[int] = []
+    reconstruct(take, [0], SMALL, progress=lambda done, total, what: told.append(done))
+    assert told == [1]
+
+
+def test_points_alone_are_a_product_of_their_own(tmp_path, images, result):
+    take = import_take(_visit(tmp_path, images), tmp_path / "take")
+    (path,) = reconstruct(take, [0], replace(SMALL, mesh=False))
+    assert path.name == "points_0000.ply"
+    points = read_points(path)
+    assert points.vertices.tobytes() == result.points.positions.tobytes()
+    assert points.normals.tobytes() == result.points.normals.tobytes()
+    assert points.confidence.tobytes() == result.points.confidence.tobytes()
+    assert len(points.triangles) == 0
+    report = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
+    assert (report["vertices"], report["triangles"]) == (len(result.points), 0)
+    with pytest.raises(TakeError, match=r"points without faces.*likeness recon"):
+        load_scan(path)
+    with pytest.raises(SettingsError, match=r"recon\.depth_maps"):
+        replace(SMALL, mesh=False, depth_maps=True)
+
+
+def test_depth_maps_are_added_to_finished_scans(tmp_path, images):
+    take = import_take(_visit(tmp_path, images), tmp_path / "take")
+    (path,) = reconstruct(take, [0], SMALL)
+    stamp = path.stat().st_mtime_ns
+    assert not (path.parent / "depth").exists()
+    reconstruct(take, [0], replace(SMALL, depth_maps=True))
+    assert path.stat().st_mtime_ns == stamp
+    out = path.parent / "depth" / "frame_0000.npz"
+    maps = read_depth_maps(out, take.cameras())
+    stamp = out.stat().st_mtime_ns
+    reconstruct(take, [0], replace(SMALL, depth_maps=True))
+    assert out.stat().st_mtime_ns == stamp
+    for camera in take.cameras():
+        pixels = np.array([[100.0, 95.0], [80.0, 100.0], [110.0, 120.0]])
+        truth = camera.depths(hit(camera, pixels))
+        columns, rows = pixels.astype(int).T
+        np.testing.assert_allclose(maps[camera.name][rows, columns], truth, atol=0.8)  # mm
+    scan = load_scan(path)
+    again = depth_map(ARRAY[0], scan.vertices, scan.triangles)
+    np.testing.assert_array_equal(again, maps[ARRAY[0].name])
+
+
 @pytest.mark.slow
 @pytest.mark.shared_data
 @pytest.mark.parametrize("frame", [0, 6])
@@ -144,12 +248,27 @@ def test_a_face_meets_the_limits(tmp_path, frame: int):
     assert score["outliers_1mm"] <= 0.005
 
 
-def _visit(folder: Path, images: dict[str, np.ndarray]) -> Path:
-    """A visiting take of one frame, as files."""
+def _visit(folder: Path, *frames: dict[str, np.ndarray]) -> Path:
+    """A visiting take of some frames, as files."""
 
     source = folder / "visit"
-    for name, image in images.items():
-        (source / name).mkdir(parents=True)
-        cv2.imwrite(str(source / name / "0000.png"), image)
-    write_cameras(source / "cameras.json", ARRAY)
+    for number, images in enumerate(frames):
+        for name, image in images.items():
+            (source / name).mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(source / name / f"{number:04d}.png"), image)
+    array = CameraArray(tuple(ARRAY.by_name(name) for name in frames[0]))
+    write_cameras(source / "cameras.json", array)
     return source
+
+
+def _shelf(folder: Path) -> dict[str, bytes]:
+    """All products of a folder by name; of the numbers, all but the time they took."""
+    out = {}
+    for path in sorted(folder.rglob("*")):
+        if path.is_file():
+            out[path.relative_to(folder).as_posix()] = path.read_bytes()
+        if path.suffix == ".json" and "record" not in path.name:
+            told = json.loads(path.read_text(encoding="utf-8"))
+            del told["seconds"]
+            out[path.name] = json.dumps(told).encode()
+    return out

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from capture.arrays import Bools, Floats32, check_shape
 from capture.errors import SettingsError
 from recon.images import noise_sigma
-from recon.refine import Refined, grow, refine_disparity
+from recon.refine import Refined, Refiner, grow
 
 _GROW_NCC = 0.4  # correlation from which a refined pixel lends its disparity to its neighbours
 
@@ -184,7 +184,7 @@ def pyramid(left: Floats32, right: Floats32, size_px: int) -> list[tuple[Floats3
     """Both views, halved until the longer side is at most `size_px`; full resolution first."""
     levels = [(left, right)]
     while max(levels[-1][0].shape) > size_px:
-        levels.append((_halve(levels[-1][0]), _halve(levels[-1][1])))
+        levels.append((halve(levels[-1][0]), halve(levels[-1][1])))
     return levels
 
 
@@ -195,12 +195,10 @@ def _climb(
     start = seed
     refined = Refined(seed, np.full_like(seed, np.nan), np.full_like(seed, np.nan))
     for index in range(len(levels) - 1, -1, -1):
-        view, other = levels[index]
+        refiner = Refiner(*levels[index])
         rounds = settings.growth if index == len(levels) - 1 else settings.growth - 1
         for turn in range(max(rounds, 1)):
-            refined = refine_disparity(
-                view,
-                other,
+            refined = refiner.refine(
                 grow(start, settings.growth_px),
                 radius=settings.radius,
                 iterations=settings.iterations if turn == rounds - 1 else settings.iterations // 2,
@@ -294,8 +292,8 @@ def _local_deviation(image: Floats32, radius: int) -> Floats32:
     return deviation
 
 
-def _halve(image: Floats32) -> Floats32:
-    """Half resolution by the mean of 2 x 2; NaN where any of the four is."""
+def halve(image: Floats32) -> Floats32:
+    """An image (H, W) at half resolution by the mean of 2 x 2; NaN where any of the four is."""
     height, width = image.shape[0] // 2 * 2, image.shape[1] // 2 * 2
     even = image[:height, :width]
     quarter = (even[0::2, 0::2] + even[0::2, 1::2] + even[1::2, 0::2] + even[1::2, 1::2]) * 0.25

@@ -13,18 +13,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numba
 import numpy as np
 from scipy import ndimage
 
-from capture.arrays import Bools, Floats32
+from capture.arrays import Floats32, Ints
+from recon.window_match import known_ranges, match_step
 
 # A cubic through neighbours 1 and 2 steps away answers -5/3 to its shortest wave: undamped, that
-# wave would grow. Neighbours 2 and 4 away calm waves as long as the window, which matching cannot
-# see.
+# wave would grow.
 _DAMPING = np.float32(0.8)
-_WAYS = ((0, 1), (1, 0), (0, 2), (2, 0))
+_PAD = 4  # farthest neighbour looked at, px
+_WAYS = ((0, 1), (1, 0), (0, 2), (2, 0))  # (down, right) to the near neighbours
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,44 +43,43 @@ class Refined:
     sigma_px: Floats32
 
 
-def refine_disparity(
-    left: Floats32,
-    right: Floats32,
-    start: Floats32,
-    *,
-    radius: int,
-    iterations: int,
-    smoothness: float,
-) -> Refined:
-    """Refine a disparity map of a rectified pair by coupled matching and smoothing.
+class Refiner:
+    """Refines disparity maps of one rectified pair at one resolution."""
 
-    Args:
-        left: (H, W) reference view; NaN off the image.
-        right: (H, W) other view; NaN off the image.
-        start: (H, W) disparity, px, within about a pixel of the truth; NaN where unknown.
-        radius: of the square window, px.
-        iterations: steps; each moves a pixel by at most half a pixel.
-        smoothness: weight of the smooth surface against a match that is known to 0.1 px.
+    def __init__(self, left: Floats32, right: Floats32) -> None:
+        """Prepare two views (H, W), NaN off the image."""
+        self._left, self._right = left, right
+        self._coefficients = spline_rows(right)
+        self._slope = row_slope(left)
 
-    Returns:
-        The refined map; the mask of known pixels only shrinks.
+    def refine(
+        self, start: Floats32, *, radius: int, iterations: int, smoothness: float
+    ) -> Refined:
+        """Refine a disparity map by coupled matching and smoothing.
 
-    References:
-        Gruen, Adaptive least squares correlation, 1985 (the step); Baker and Matthews,
-        Lucas-Kanade 20 years on, IJCV 2004 (gradient of the reference, which does not correlate
-        with the noise of the warped view); Beeler et al., High-quality single-shot capture of
-        facial geometry, 2010, section 4 (coupling to second-order smoothness by confidence).
-    """
-    coefficients = spline_rows(right)
-    slope = row_slope(left)
-    disparity = start.astype(np.float32, copy=True)
-    ncc = np.full_like(disparity, np.nan)
-    sigma = np.full_like(disparity, np.nan)
-    for _ in range(iterations):
-        warped = warp_rows(coefficients, right, disparity)
-        step, ncc, sigma = match_step(left, slope, warped, radius)
-        disparity = smooth_step(disparity, step, sigma, np.float32(smoothness))
-    return Refined(disparity, ncc, sigma)
+        Args:
+            start: (H, W) disparity, px, within about a pixel of the truth; NaN where unknown.
+            radius: of the window, px.
+            iterations: steps; each moves a pixel by at most half a pixel.
+            smoothness: weight of the smooth surface against a match that is known to 0.1 px.
+
+        Returns:
+            The refined map; the mask of known pixels only shrinks.
+
+        References:
+            Gruen, Adaptive least squares correlation, 1985 (the step); Baker and Matthews,
+            Lucas-Kanade 20 years on, IJCV 2004 (gradient of the reference, which does not correlate
+            with the noise of the warped view); Beeler et al., High-quality single-shot capture of
+            facial geometry, 2010, section 4 (coupling to second-order smoothness by confidence).
+        """
+        disparity = start.astype(np.float32, copy=True)
+        ncc = np.full_like(disparity, np.nan)
+        sigma = np.full_like(disparity, np.nan)
+        for _ in range(iterations):
+            warped = warp_rows(self._coefficients, self._right, disparity)
+            step, ncc, sigma = match_step(self._left, self._slope, warped, radius)
+            disparity = smooth_step(disparity, step, sigma, np.float32(smoothness))
+        return Refined(disparity, ncc, sigma)
 
 
 def spline_rows(image: Floats32) -> Floats32:
@@ -129,101 +128,6 @@ def warp_rows(
                 + t * t * t * sixth * coefficients[i, x0 + 2]
             )
     return out
-
-
-def match_step(
-    left: Floats32, slope: Floats32, warped: Floats32, radius: int
-) -> tuple[Floats32, Floats32, Floats32]:
-    """One least-squares matching step of every window, with gain and offset.
-
-    Args:
-        left: (H, W) reference.
-        slope: (H, W) its derivative along the rows, per px.
-        warped: (H, W) the other view at the current disparity.
-        radius: of the window, px.
-
-    Returns:
-        Step (H, W), px, to add to the disparity; correlation before the step; predicted standard
-        deviation of the disparity, px. NaN where fewer than half of the window is known.
-    """
-    known = np.isfinite(left) & np.isfinite(slope) & np.isfinite(warped)
-    level = np.float32(left[known].mean()) if known.any() else np.float32(0.0)
-    means = _products(left, slope, warped, known, level)
-    for plane in means:
-        _window_mean(plane, radius)
-    step, ncc, sigma = _solve_windows(means, known, (1.5 * (radius + 1)) ** 2)
-    return step, ncc, sigma
-
-
-@numba.njit(cache=True, nogil=True)
-def _products(
-    left: Floats32, slope: Floats32, warped: Floats32, known: Bools, level: np.float32
-) -> Floats32:  # pragma: no cover - compiled
-    """Planes (10, H, W): mask, a, b, g and their six products, 0 where not known."""
-    height, width = known.shape
-    out = np.zeros((10, height, width), np.float32)
-    for i in range(height):
-        for j in range(width):
-            if not known[i, j]:
-                continue
-            a, b, g = left[i, j] - level, warped[i, j] - level, slope[i, j]
-            out[0, i, j] = np.float32(1.0)
-            out[1, i, j], out[2, i, j], out[3, i, j] = a, b, g
-            out[4, i, j], out[5, i, j], out[6, i, j] = a * a, b * b, g * g
-            out[7, i, j], out[8, i, j], out[9, i, j] = a * b, a * g, b * g
-    return out
-
-
-def _window_mean(plane: Floats32, radius: int) -> None:
-    """Weighted mean of (H, W), in place, over a pyramid-shaped window; 0 counts outside.
-
-    The window is a box passed twice: its spectrum is never negative. With a plain box the iteration
-    would amplify disparity waves a little shorter than the window, and diverge.
-    """
-    for length in (radius // 2 * 2 + 1, (radius + 1) // 2 * 2 + 1):
-        size = (length, length)
-        cv2.boxFilter(plane, cv2.CV_32F, size, dst=plane, borderType=cv2.BORDER_CONSTANT)
-
-
-@numba.njit(cache=True, nogil=True)
-def _solve_windows(
-    means: Floats32, known: Bools, area: float
-) -> tuple[Floats32, Floats32, Floats32]:  # pragma: no cover - compiled
-    """The 2x2 normal equations (gain, shift) of every pixel from window means of products."""
-    height, width = known.shape
-    step = np.full((height, width), np.float32(np.nan))
-    ncc = np.full((height, width), np.float32(np.nan))
-    sigma = np.full((height, width), np.float32(np.nan))
-    for i in range(height):
-        for j in range(width):
-            share = means[0, i, j]
-            if not known[i, j] or share < 0.5:
-                continue
-            ma, mb, mg = means[1, i, j] / share, means[2, i, j] / share, means[3, i, j] / share
-            saa = means[4, i, j] / share - ma * ma
-            sbb = means[5, i, j] / share - mb * mb
-            sgg = means[6, i, j] / share - mg * mg
-            sab = means[7, i, j] / share - ma * mb
-            sag = means[8, i, j] / share - ma * mg
-            sbg = means[9, i, j] / share - mb * mg
-            if saa < 1e-10 or sbb < 1e-10 or sgg < 1e-12:
-                continue
-            correlation = sab / np.sqrt(saa * sbb)
-            ncc[i, j] = correlation
-            determinant = saa * sgg - sag * sag
-            if correlation < 0.1 or determinant < 1e-3 * saa * sgg:
-                continue
-            # b - mean = gain (a - mean) + shift g: the warped view as a moved copy of the reference
-            gain = (sab * sgg - sbg * sag) / determinant
-            shift = (sbg * saa - sab * sag) / determinant
-            if gain < 0.1:
-                continue
-            moved = shift / gain
-            step[i, j] = min(max(moved, np.float32(-0.5)), np.float32(0.5))
-            residual = max(sbb - gain * sab - shift * sbg, np.float32(1e-12))
-            across = max(sgg - sag * sag / saa, np.float32(1e-12))
-            sigma[i, j] = np.sqrt(residual / (across * share * area)) / gain
-    return step, ncc, sigma
 
 
 def grow(disparity: Floats32, steps: int) -> Floats32:
@@ -292,11 +196,15 @@ def _extrapolated(disparity: Floats32, i: int, j: int) -> np.float32:  # pragma:
     return np.float32(min(max(value, low - reach), high + reach))
 
 
-@numba.njit(cache=True, nogil=True)
 def smooth_step(
     disparity: Floats32, step: Floats32, sigma: Floats32, smoothness: np.float32
-) -> Floats32:  # pragma: no cover - compiled
+) -> Floats32:
     """Apply matching steps, then pull towards the second-order smooth surface of the neighbours.
+
+    Along each axis, a cubic through four neighbours one and two steps away predicts the value; so
+    does one through neighbours two and four away, which calms waves as long as the window, which
+    matching cannot see. Where the outer neighbours are unknown the mean of the inner two serves. A
+    bend at the pixel lowers the weight of that axis.
 
     Args:
         disparity: (H, W) px; NaN unknown.
@@ -308,56 +216,110 @@ def smooth_step(
         (H, W) px; NaN where `disparity` is.
     """
     height, width = disparity.shape
-    moved = np.empty((height, width), np.float32)
+    padded = np.full((height + 2 * _PAD, width + 2 * _PAD), np.float32(np.nan))
+    ranges = known_ranges(np.isfinite(disparity))
+    return _smooth_rows(disparity, step, sigma, np.float32(smoothness), ranges, padded)  # type: ignore[no-any-return]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _smooth_rows(
+    disparity: Floats32,
+    step: Floats32,
+    sigma: Floats32,
+    smoothness: np.float32,
+    ranges: Ints,
+    padded: Floats32,
+) -> Floats32:  # pragma: no cover - compiled
+    height, width = disparity.shape
+    zero = np.float32(0.0)
     for i in range(height):
-        for j in range(width):
+        line = padded[i + _PAD]
+        for j in range(ranges[i, 0], ranges[i, 1]):
             s = step[i, j]
-            moved[i, j] = disparity[i, j] if np.isnan(s) else disparity[i, j] + s
-    out = moved.copy()
+            line[j + _PAD] = disparity[i, j] + (s if s == s else zero)
+    out = np.full((height, width), np.float32(np.nan))
+    scratch = np.empty((4, width), np.float32)
     for i in range(height):
-        for j in range(width):
-            centre = moved[i, j]
-            if np.isnan(centre):
-                continue
-            total, weight = np.float32(0.0), np.float32(0.0)
-            for way in range(4):
-                di, dj = _WAYS[way]
-                predicted, bend = _second_order(moved, i, j, di, dj)
-                if np.isnan(predicted):
-                    continue
-                w = np.exp(-bend * bend)
-                total += w * predicted
-                weight += w
-            if weight < np.float32(1e-6) or smoothness <= np.float32(0.0):
-                continue
-            target = total / weight
-            trust = np.float32(0.0)
-            if not np.isnan(step[i, j]):
-                trust = np.float32(0.01) / (sigma[i, j] * sigma[i, j] + np.float32(1e-4))
-            pull = smoothness * weight * np.float32(0.25)
-            out[i, j] = centre + _DAMPING * pull / (trust + pull) * (target - centre)
+        low, high = ranges[i, 0], ranges[i, 1]
+        if high <= low:
+            continue
+        total, weight = scratch[0, low:high], scratch[1, low:high]
+        predicted, share = scratch[2, low:high], scratch[3, low:high]
+        total[:] = weight[:] = zero
+        row, first, last = i + _PAD, low + _PAD, high + _PAD
+        centre = padded[row, first:last]
+        for way in range(4):
+            down, right = _WAYS[way]
+            below = padded[row - down, first - right : last - right]
+            above = padded[row + down, first + right : last + right]
+            down, right = 2 * down, 2 * right
+            far_below = padded[row - down, first - right : last - right]
+            far_above = padded[row + down, first + right : last + right]
+            _predict(far_below, below, above, far_above, predicted)
+            _weigh(below, centre, above, predicted, share)
+            _accumulate(predicted, share, total, weight)
+        _settle(
+            centre, step[i, low:high], sigma[i, low:high], smoothness, total, weight,
+            out[i, low:high],
+        )  # fmt: skip
     return out
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
-def _second_order(
-    field: Floats32, i: int, j: int, di: int, dj: int
-) -> tuple[np.float32, np.float32]:  # pragma: no cover - compiled
-    """The value that a cubic through four neighbours along one axis predicts, and the bend there.
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _predict(
+    far_below: Floats32, below: Floats32, above: Floats32, far_above: Floats32, out: Floats32
+) -> None:  # pragma: no cover - compiled
+    """What a cubic through four neighbours says, or the mean of the near two; NaN without those."""
+    half, third = np.float32(0.5), np.float32(1.0 / 3.0)
+    for j in range(len(out)):
+        mean = half * (below[j] + above[j])
+        outer = half * (far_below[j] + far_above[j])
+        cubic = mean + (mean - outer) * third
+        out[j] = cubic if cubic == cubic else mean
 
-    Falls back on the mean of the two nearest where the outer ones are unknown.
-    """
-    height, width = field.shape
-    nan = np.float32(np.nan)
-    if i - di < 0 or j - dj < 0 or i + di >= height or j + dj >= width:
-        return nan, nan
-    low, high = field[i - di, j - dj], field[i + di, j + dj]
-    if np.isnan(low) or np.isnan(high):
-        return nan, nan
-    mean = np.float32(0.5) * (low + high)
-    bend = abs(low - field[i, j]) - abs(high - field[i, j])
-    if i - 2 * di >= 0 and j - 2 * dj >= 0 and i + 2 * di < height and j + 2 * dj < width:
-        outer = np.float32(0.5) * (field[i - 2 * di, j - 2 * dj] + field[i + 2 * di, j + 2 * dj])
-        if not np.isnan(outer):
-            return (np.float32(4.0) * mean - outer) / np.float32(3.0), bend
-    return mean, bend
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _weigh(
+    below: Floats32, centre: Floats32, above: Floats32, predicted: Floats32, out: Floats32
+) -> None:  # pragma: no cover - compiled
+    """The say of one axis: less across a bend, none where it predicts nothing."""
+    one, quarter = np.float32(1.0), np.float32(0.25)
+    for j in range(len(out)):
+        bend = abs(below[j] - centre[j]) - abs(above[j] - centre[j])
+        flat = one / (one + quarter * bend * bend)
+        flat = flat * flat
+        out[j] = flat * flat if predicted[j] == predicted[j] else np.float32(0.0)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _accumulate(
+    predicted: Floats32, share: Floats32, total: Floats32, weight: Floats32
+) -> None:  # pragma: no cover - compiled
+    zero = np.float32(0.0)
+    for j in range(len(total)):
+        total[j] += share[j] * predicted[j] if share[j] > zero else zero
+    for j in range(len(total)):
+        weight[j] += share[j]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _settle(
+    centre: Floats32,
+    step: Floats32,
+    sigma: Floats32,
+    smoothness: np.float32,
+    total: Floats32,
+    weight: Floats32,
+    out: Floats32,
+) -> None:  # pragma: no cover - compiled
+    """Between the match and the surface, by their weights."""
+    zero, quarter, tiny = np.float32(0.0), np.float32(0.25), np.float32(1e-6)
+    small, hundredth = np.float32(1e-4), np.float32(0.01)
+    for j in range(len(out)):
+        total[j] = total[j] / weight[j] - centre[j] if weight[j] >= tiny else zero
+    for j in range(len(out)):
+        trust = hundredth / (sigma[j] * sigma[j] + small)
+        trust = trust if step[j] == step[j] else zero
+        pull = smoothness * weight[j] * quarter
+        share = pull / max(trust + pull, tiny)
+        out[j] = centre[j] + _DAMPING * share * total[j]

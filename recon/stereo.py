@@ -8,14 +8,20 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from capture.arrays import Floats, Floats32, Image
+from capture.arrays import Floats, Floats32, Image, Ints
 from capture.camera import CameraArray
 from capture.errors import CameraError, SettingsError
-from recon.disparity import DisparityMap, DisparitySettings, Reason, match_pair, pyramid
+from recon.disparity import DisparityMap, DisparitySettings, Reason, halve, match_pair
 from recon.fusion import DepthView
 from recon.images import mono
 from recon.pairs import PairSettings, StereoPair, scene_centre, select_pairs
-from recon.rectify import Rectification, rectification, resample, spline_coefficients
+from recon.rectify import (
+    Rectification,
+    coarser,
+    rectification,
+    rectified,
+    spline_coefficients,
+)
 
 _SEARCH_PX = 240  # longest side of the crop in the wide search
 _MARGIN = 0.06  # of the found disparities and of the crop, added on each side
@@ -104,18 +110,43 @@ def match_views(
         CameraError: when no pair can be formed, or an image has another size than its camera.
     """
     centre, pairs = stereo_pairs(cameras, settings)
+    geometries = [_geometry(cameras, pair, centre, settings) for pair in pairs]
+    halvings = [_search_halvings(geometry) for geometry in geometries]
     used = sorted({index for pair in pairs for index in (pair.left, pair.right)})
     with ThreadPoolExecutor(max_workers=max(workers, 1)) as pool:
-        planes = pool.map(lambda index: _plane(cameras, images, index), used)
+        planes = pool.map(lambda index: _planes(cameras, images, index, max(halvings)), used)
         coefficients = dict(zip(used, planes, strict=True))
 
-        def one(pair: StereoPair) -> PairDepth:
-            return _match(cameras, coefficients, pair, centre, settings)
+        def one(task: tuple[StereoPair, Rectification, int]) -> PairDepth:
+            pair, geometry, level = task
+            left, right = coefficients[pair.left], coefficients[pair.right]
+            found = _search(geometry, (left[level], right[level]), level, centre, settings)
+            if found is None:
+                pixels = geometry.width * geometry.height
+                return PairDepth(pair, None, 0.0, {Reason.NO_SEED.name: pixels})
+            crop, limits = found
+            views = (rectified(crop, "left", left[0]), rectified(crop, "right", right[0]))
+            return _packaged(pair, crop, match_pair(*views, limits, settings.matching))
 
-        return list(pool.map(one, pairs))
+        return list(pool.map(one, zip(pairs, geometries, halvings, strict=True)))
 
 
-def _plane(cameras: CameraArray, images: Mapping[str, Image], index: int) -> Floats32:
+def _geometry(
+    cameras: CameraArray, pair: StereoPair, centre: Floats, settings: StereoSettings
+) -> Rectification:
+    return rectification(cameras[pair.left], cameras[pair.right], centre, settings.extent_mm)
+
+
+def _search_halvings(geometry: Rectification) -> int:
+    """Halvings after which a pair is small enough for the wide search."""
+    longest = max(geometry.width, geometry.height)
+    return max(int(np.ceil(np.log2(longest / _SEARCH_PX))), 0)
+
+
+def _planes(
+    cameras: CameraArray, images: Mapping[str, Image], index: int, halvings: int
+) -> list[Floats32]:
+    """Spline coefficients of an image and of its halvings."""
     camera = cameras[index]
     grey = mono(images[camera.name])
     if grey.shape != (camera.height, camera.width):
@@ -123,33 +154,10 @@ def _plane(cameras: CameraArray, images: Mapping[str, Image], index: int) -> Flo
             f"{camera.name}: the camera is {camera.width} x {camera.height} px, "
             f"its image {grey.shape[1]} x {grey.shape[0]}"
         )
-    return spline_coefficients(grey)
-
-
-def _match(
-    cameras: CameraArray,
-    coefficients: Mapping[int, Floats32],
-    pair: StereoPair,
-    centre: Floats,
-    settings: StereoSettings,
-) -> PairDepth:
-    """Search wide at low resolution, crop to what was found, match the crop."""
-    geometry = rectification(cameras[pair.left], cameras[pair.right], centre, settings.extent_mm)
-    views = (coefficients[pair.left], coefficients[pair.right])
-    wide = _rectified(geometry, *views)
-    depth = float(geometry.rotation[2] @ (centre - geometry.left.centre))
-    reach = min(settings.depth_mm, 0.8 * depth)
-    low, high = geometry.disparity(np.array([depth + reach, depth - reach])).tolist()
-    found = _search(wide, (low, high), settings)
-    if found is None:
-        return PairDepth(pair, None, 0.0, {Reason.NO_SEED.name: int(wide[0].size)})
-    column, row, width, height, limits = found
-    crop = geometry.cropped(column, row, width, height)
-    left, right = (view[row : row + height, column : column + width] for view in wide)
-    result = match_pair(
-        np.ascontiguousarray(left), np.ascontiguousarray(right), limits, settings.matching
-    )
-    return _packaged(pair, crop, result)
+    levels = [grey]
+    for _ in range(halvings):
+        levels.append(halve(levels[-1]))
+    return [spline_coefficients(level) for level in levels]
 
 
 def _packaged(pair: StereoPair, crop: Rectification, result: DisparityMap) -> PairDepth:
@@ -162,46 +170,58 @@ def _packaged(pair: StereoPair, crop: Rectification, result: DisparityMap) -> Pa
     )
 
 
-def _rectified(
-    geometry: Rectification, left: Floats32, right: Floats32
-) -> tuple[Floats32, Floats32]:
-    views = []
-    for side, coefficients in (("left", left), ("right", right)):
-        values, inside = resample(coefficients, *geometry.maps(side))
-        values[~inside] = np.nan
-        views.append(values)
-    return views[0], views[1]
-
-
 def _search(
-    wide: tuple[Floats32, Floats32], limits: tuple[float, float], settings: StereoSettings
-) -> tuple[int, int, int, int, tuple[float, float]] | None:
-    """Window (column, row, width, height) in both views, and the disparities found there."""
-    levels = pyramid(*wide, _SEARCH_PX)
-    factor = 2 ** (len(levels) - 1)
-    small = (limits[0] / factor, limits[1] / factor)
+    geometry: Rectification,
+    coefficients: tuple[Floats32, Floats32],
+    halvings: int,
+    centre: Floats,
+    settings: StereoSettings,
+) -> tuple[Rectification, tuple[float, float]] | None:
+    """Look through the whole depth range at low resolution.
+
+    Returns:
+        The geometry cropped to what was found in both views, and the least and greatest disparity
+        there; None where too little was found.
+    """
+    scale = 2.0**halvings
+    small = rectification(
+        coarser(geometry.left, halvings), coarser(geometry.right, halvings), centre,
+        settings.extent_mm,
+    )  # fmt: skip
+    depth = float(geometry.rotation[2] @ (centre - geometry.left.centre))
+    reach = min(settings.depth_mm, 0.8 * depth)
+    far, near = small.disparity(np.array([depth + reach, depth - reach])).tolist()
     matching = replace(
-        settings.matching, seed_px=_SEARCH_PX, iterations=3, growth=1, fragment_px=40, edge_px=0
+        settings.matching, seed_px=4096, iterations=3, growth=1, fragment_px=40, edge_px=0
     )
-    coarse = match_pair(*levels[-1], small, matching).disparity
+    views = (rectified(small, "left", coefficients[0]), rectified(small, "right", coefficients[1]))
+    coarse = match_pair(*views, (far, near), matching).disparity
     known = np.isfinite(coarse)
     if known.sum() < 30:
         return None
-    values = coarse[known]
-    low, high = np.percentile(values, [0.2, 99.8]).tolist()
-    margin = _MARGIN * (small[1] - small[0])
-    low, high = max(low - margin, small[0]), min(high + margin, small[1])
+    low, high = np.percentile(coarse[known], [0.2, 99.8]).tolist()
+    margin = _MARGIN * (near - far)
+    low, high = max(low - margin, far), min(high + margin, near)
     rows, columns = np.nonzero(known & (coarse >= low) & (coarse <= high))
-    pad = int(np.ceil(_MARGIN * max(coarse.shape)))
     landed = columns - coarse[rows, columns]
-    box = np.array(
-        [
-            min(columns.min(), landed.min()) - pad,
-            rows.min() - pad,
-            max(columns.max(), landed.max()) + pad + 1,
-            rows.max() + pad + 1,
-        ]
-    )
-    height, width = wide[0].shape
-    x0, y0, x1, y1 = np.clip(np.rint(box * factor), 0, [width, height, width, height]).astype(int)
-    return int(x0), int(y0), int(x1 - x0), int(y1 - y0), (low * factor, high * factor)
+    return _window(geometry, small, (rows, columns, landed), scale), (low * scale, high * scale)
+
+
+def _window(
+    geometry: Rectification,
+    small: Rectification,
+    found: tuple[Ints, Ints, Floats],
+    scale: float,
+) -> Rectification:
+    """The geometry cropped to what was found at a lower resolution, in both views."""
+    rows, columns, landed = found
+    pad = np.ceil(_MARGIN * max(small.width, small.height))
+    left = scale * (columns - small.left_column) + geometry.left_column
+    right = scale * (landed - small.right_column) + geometry.right_column
+    down = scale * (rows - small.row) + geometry.row
+    margin = scale * (pad + 1)
+    x0, x1 = min(left.min(), right.min()) - margin, max(left.max(), right.max()) + margin
+    y0, y1 = down.min() - margin, down.max() + margin
+    size = [geometry.width, geometry.height, geometry.width, geometry.height]
+    x0, y0, x1, y1 = np.clip(np.rint([x0, y0, x1, y1]), 0, size).astype(int)
+    return geometry.cropped(int(x0), int(y0), int(x1 - x0), int(y1 - y0))

@@ -6,7 +6,7 @@ from scipy import ndimage
 
 from capture.camera import Camera
 from capture.errors import CameraError
-from recon.rectify import rectification, resample, spline_coefficients
+from recon.rectify import rectification, rectified, resample, spline_coefficients
 from tests.synthetic_stereo import ring
 
 
@@ -74,6 +74,22 @@ def test_spline_resampling_agrees_with_scipy():
     assert not inside[0, 0]
     assert values[0, 0] == 0.0
     np.testing.assert_allclose(values[inside], slow[inside], atol=2e-6)
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_the_fast_rectification_is_the_literal_one(side: str):
+    cameras = ring()
+    geometry = rectification(cameras[0], cameras[1], np.zeros(3), 120.0)
+    geometry = geometry.cropped(5, 3, geometry.width - 5, geometry.height - 3)
+    camera: Camera = getattr(geometry, side)
+    image = np.random.default_rng(4).uniform(0, 1, (camera.height, camera.width))
+    coefficients = spline_coefficients(ndimage.gaussian_filter(image, 1.0).astype(np.float32))
+    fast = rectified(geometry, side, coefficients)
+    slow, inside = resample(coefficients, *geometry.maps(side))
+    assert (np.isfinite(fast) != inside).mean() < 1e-3  # the very border, to rounding
+    both = np.isfinite(fast) & inside
+    assert both.sum() > 1000
+    np.testing.assert_allclose(fast[both], slow[both], atol=1e-5)
 
 
 def test_two_cameras_at_one_place_have_no_baseline():

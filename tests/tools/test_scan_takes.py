@@ -13,6 +13,7 @@ from recon.surface import closest_points
 from tools.bench.scan_takes import Head, face_region, load_head, photographs, studio, write_take
 
 SHARED = Path(__file__).resolve().parents[2].parent / "shared"
+FLAT = np.zeros((4, 4, 2), np.float32)
 SPOT = (0.62, 0.35)  # uv of the dark spot on the wall
 
 
@@ -30,9 +31,9 @@ def wall(spacing_mm: float = 30.0, count: int = 7) -> Head:
     triangles = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]).astype(np.int32)
     rows, columns = np.mgrid[0:256, 0:256]
     x, y = SPOT[0] * 256 - 0.5, (1 - SPOT[1]) * 256 - 0.5
-    texture = 0.7 - 0.6 * np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / (2 * 4.0**2))
+    texture = 0.35 - 0.3 * np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / (2 * 4.0**2))
     normals = vertex_normals(vertices, triangles)
-    return Head(vertices, normals, np.stack([u, v], 1), triangles, texture.astype(np.float32))
+    return Head(vertices, normals, np.stack([u, v], 1), triangles, texture.astype(np.float32), FLAT)
 
 
 def test_a_spot_of_the_texture_lands_where_the_camera_projects_it() -> None:
@@ -59,10 +60,25 @@ def test_the_lens_bends_what_is_drawn() -> None:
     assert np.mean(np.abs(pictures["bent"].astype(float) - pictures["cam07"])) > 5.0
 
 
+def test_relief_brightens_what_it_turns_to_the_light() -> None:
+    head, cameras = wall(), CameraArray((studio(96, 3)[7],))
+    along_u, along_v = head.tangents()
+    assert np.allclose(along_u, [1.0, 0.0, 0.0])
+    assert np.allclose(along_v, [0.0, 1.0, 0.0])
+    light = []
+    for slope in (-0.4, 0.4):  # the strongest light comes from above
+        turned = Head(
+            head.vertices, head.normals, head.uv, head.triangles, head.texture,
+            FLAT + np.array([0.0, slope], np.float32),
+        )  # fmt: skip
+        light.append(dict(photographs(turned, cameras, seed=3))["cam07"].mean())
+    assert light[1] > light[0] + 3.0
+
+
 def test_halving_keeps_the_surface() -> None:
     head = wall(count=3)
     bumpy = head.vertices + np.array([0, 0, 1]) * np.arange(9)[:, None] ** 2
-    head = Head(bumpy, head.normals, head.uv, head.triangles, head.texture)
+    head = Head(bumpy, head.normals, head.uv, head.triangles, head.texture, FLAT)
     fine = head.halved()
     assert len(fine.triangles) == 4 * len(head.triangles)
     centres = fine.vertices[fine.triangles].mean(axis=1)
@@ -75,7 +91,7 @@ def test_seams_are_welded_and_slivers_dropped() -> None:
     triangles = head.triangles.copy()
     triangles[0][triangles[0] == 4] = 9
     triangles = np.concatenate([triangles, [[4, 9, 0]]]).astype(np.int32)
-    seamed = Head(doubled, doubled, doubled[:, :2], triangles, head.texture)
+    seamed = Head(doubled, doubled, doubled[:, :2], triangles, head.texture, FLAT)
     places, faces = seamed.surface()
     assert len(places) == 9
     assert len(faces) == len(head.triangles)

@@ -1,12 +1,13 @@
 """A visiting take of a photographed head, with truth: skin without made-up pores to hold on to.
 
-    python -m tools.bench.scan_takes OUT --shared ../shared [--size 1024] [--seed 5]
+    python -m tools.bench.scan_takes OUT --shared ../shared [--size 1024] [--seed 5] [--relief 1]
 
-The head is Lee Perry-Smith's scan (CC BY 3.0) under its photographed texture, half a millimetre a
-texel, lit by four lights; sixteen cameras of its own with distortion, gains, a point spread of
-0.6 px and noise of 1.6 grey levels. OUT gets cameras.json, `<camera>/0000.png` and truth.npz, so
-that score_scan.py works on it as on any rendered take. The facets of the scan are the true surface:
-only the shading is smooth.
+The head is Lee Perry-Smith's scan (CC BY 3.0) under its photographed texture in linear light, half
+a millimetre a texel, and its normal map, which shades but moves no surface (`--relief 0` leaves it
+out: skin that is harder still), lit by four lights; sixteen cameras of its own with distortion,
+gains, a point spread of 0.6 px and noise of 1.6 grey levels. OUT gets cameras.json,
+`<camera>/0000.png` and truth.npz, so that score_scan.py works on it as on any rendered take. The
+facets of the scan are the true surface: only the shading is smooth.
 """
 
 from __future__ import annotations
@@ -37,8 +38,8 @@ _HALVINGS = 2  # of the drawn triangles, so that the lens is nearly projective w
 _YAWS_DEG = (-62.0, -45.0, -27.0, -9.0, 9.0, 27.0, 45.0, 62.0)
 _PITCHES_DEG = ((14.0, -6.0), (22.0, 2.0))
 _RADIUS_MM, _FOCAL_SIZES, _AIM_MM = 620.0, 2.25, np.array([0.0, 0.0, -10.0])
-_PSF_PX, _NOISE_DN, _SHOT_DN, _WHITE_DN = 0.6, 1.6, 0.012, 235.0
-_GROUND, _AMBIENT, _VIGNETTE = 0.1, 0.22, 0.08
+_PSF_PX, _NOISE_DN, _SHOT_DN, _WHITE_DN = 0.6, 1.6, 0.012, 350.0
+_GROUND, _AMBIENT, _VIGNETTE = 0.07, 0.22, 0.08
 _LIGHTS = np.array([[0.5, 0.6, 0.9], [-0.8, 0.1, 0.6], [0.0, -0.5, 0.9], [0.9, 0.0, 0.2]])
 _POWERS = np.array([0.62, 0.35, 0.22, 0.2])
 _GLOSS, _SHARPNESS = 0.05, 18.0
@@ -56,6 +57,7 @@ class Head:
         uv: (V, 2) float64, row 0 of the texture at v = 1.
         triangles: (T, 3) int32.
         texture: (H, W) float32 albedo 0..1.
+        slopes: (H, W, 2) float32 of the normal along u and v, of the skin's relief.
     """
 
     vertices: Floats
@@ -63,6 +65,7 @@ class Head:
     uv: Floats
     triangles: Ints32
     texture: Floats32
+    slopes: Floats32
 
     def surface(self) -> tuple[Floats, Ints32]:
         """Places (V', 3), each once, and triangles (T', 3) between three of them."""
@@ -81,28 +84,50 @@ class Head:
 
         return Head(
             extended(self.vertices), extended(self.normals), extended(self.uv),
-            np.concatenate([np.stack(q, axis=1) for q in quarters]).astype(np.int32), self.texture,
+            np.concatenate([np.stack(q, axis=1) for q in quarters]).astype(np.int32),
+            self.texture, self.slopes,
         )  # fmt: skip
 
+    def tangents(self) -> tuple[Floats, Floats]:
+        """Unit directions (V, 3) in which u and v grow."""
+        edges = np.diff(self.vertices[self.triangles], axis=1)
+        steps = np.diff(self.uv[self.triangles], axis=1)
+        turned = np.stack([steps[:, 1, 1], -steps[:, 0, 1], -steps[:, 1, 0], steps[:, 0, 0]], 1)
+        sign = np.sign(turned[:, 0] * turned[:, 3] - turned[:, 1] * turned[:, 2])[:, None, None]
+        along = sign * np.einsum("tij,tjx->tix", turned.reshape(-1, 2, 2), edges)
+        total = np.zeros((len(self.vertices), 2, 3))
+        for corner in range(3):
+            np.add.at(total, self.triangles[:, corner], along)
+        total /= np.maximum(np.linalg.norm(total, axis=2, keepdims=True), 1e-12)
+        return total[:, 0], total[:, 1]
 
-def load_head(folder: Path) -> Head:
+
+def load_head(folder: Path, relief: float = 1.0) -> Head:
     """Read the scan and its texture, and bring them to millimetres.
+
+    Args:
+        folder: of the scan.
+        relief: strength of its normal map; 1 is the map as it is.
 
     Raises:
         ShapeError: when the archive is not what it should be.
         TakeError: when the texture is not there.
     """
     arrays = read_archive(folder / "LeePerrySmith.npz", ["V", "F", "T"])
-    colour = cv2.imread(str(folder / "color.jpg"), cv2.IMREAD_GRAYSCALE)
-    if colour is None:
-        raise TakeError(f"{folder / 'color.jpg'}: no such texture")
+    colour = _picture(folder / "color.jpg", cv2.IMREAD_GRAYSCALE)
     vertices = (arrays["V"].astype(np.float64) - _ORIGIN) * _MM_PER_UNIT
     triangles = arrays["F"].astype(np.int32)
     places, place = np.unique(vertices, axis=0, return_inverse=True)
     place = place.reshape(-1)
     normals = np.nan_to_num(vertex_normals(places, place[triangles].astype(np.int32)))[place]
-    texture = colour.astype(np.float32) / np.float32(255.0)
-    return Head(vertices, normals, arrays["T"].astype(np.float64), triangles, texture)
+    stored = colour.astype(np.float32) / np.float32(255.0)
+    texture = np.where(stored > 0.04045, ((stored + 0.055) / 1.055) ** 2.4, stored / 12.92)
+    bumps = _picture(folder / "normal.jpg", cv2.IMREAD_COLOR)
+    slopes = relief * (bumps[:, :, :0:-1].astype(np.float32) / 127.5 - 1.0)  # stored B G R
+    return Head(
+        vertices, normals, arrays["T"].astype(np.float64), triangles,
+        texture.astype(np.float32), slopes.astype(np.float32),
+    )  # fmt: skip
 
 
 def face_region(vertices: Floats) -> Ints:
@@ -189,9 +214,17 @@ def main() -> None:
     parser.add_argument("--shared", type=Path, required=True, help="folder with data/")
     parser.add_argument("--size", type=int, default=1024, help="of the square images, px")
     parser.add_argument("--seed", type=int, default=5, help="of cameras, lights, gains and noise")
+    parser.add_argument("--relief", type=float, default=1.0, help="strength of the normal map")
     arguments = parser.parse_args()
-    head = load_head(arguments.shared / "data" / "lee-perry-smith")
+    head = load_head(arguments.shared / "data" / "lee-perry-smith", arguments.relief)
     write_take(arguments.out, head, studio(arguments.size, arguments.seed), arguments.seed)
+
+
+def _picture(path: Path, flags: int) -> NDArray[np.uint8]:
+    found = cv2.imread(str(path), flags)
+    if found is None:
+        raise TakeError(f"{path}: no such picture")
+    return np.asarray(found, dtype=np.uint8)
 
 
 def _weld(vertices: Floats, triangles: Ints32) -> tuple[Floats, Ints32]:
@@ -215,6 +248,7 @@ def _enlarged(camera: Camera) -> Camera:
 def _light(head: Head, raster: Rasterizer, camera: Camera, lights: Floats) -> Floats32:
     """What falls on the sensor (H, W), 1 at full white."""
     seen = raster.render(camera, head.vertices)
+    along = head.tangents()
     out = np.full(seen.triangle.shape, np.float32(_GROUND))
     rows, columns = np.nonzero(seen.triangle >= 0)
     for start in range(0, len(rows), _CHUNK):
@@ -226,8 +260,12 @@ def _light(head: Head, raster: Rasterizer, camera: Camera, lights: Floats) -> Fl
             picked = values.astype(np.float32)[corners]
             return np.asarray(np.einsum("nk,nkx->nx", w, picked), dtype=np.float32)
 
-        albedo = _texels(head.texture, mixed(head.uv))
+        uv = mixed(head.uv)
+        albedo = _texels(head.texture, uv)
         normals = mixed(head.normals)
+        for axis in range(2):
+            slope = _texels(head.slopes[:, :, axis], uv)
+            normals += slope[:, None] * mixed(along[axis])
         towards = camera.centre.astype(np.float32) - mixed(head.vertices)
         out[at] = _shade(albedo, normals, towards, lights.astype(np.float32))
     return out

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -35,6 +36,8 @@ from recon.mesh_process import Mesher
 from recon.pairs import PairSettings
 from recon.point_file import is_points_file, points_scan
 from recon.prior import PriorMesh, PriorMeshes
+from recon.scan_quality import CameraQuality, camera_qualities
+from recon.scan_warnings import camera_warnings, missing_warnings, scan_warnings
 from recon.stereo import PairDepth, StereoSettings, match_views
 from recon.surface import Scan, SurfaceSettings, poisson_scan, read_ply, write_ply
 
@@ -312,6 +315,7 @@ class _Run:
             self._fail(frame, error)
             return
         report = {"frame": frame, "missing": missing, **report}
+        report["warnings"] = [*missing_warnings(missing), *report["warnings"]]
         scan = mesher.submit(points) if self._settings.mesh else None
         self._waiting.append(_Waiting(frame, points, report, scan))
 
@@ -408,7 +412,37 @@ def _matched(
             "are the cameras those of this take?"
         )
     report = _numbers(there, pairs, points)
-    return points, {**report, "seconds": seconds}
+    qualities = _timed(seconds, "quality", lambda: camera_qualities(there, images, pairs, points))
+    return points, {**report, **_diagnosis(qualities, points, report, settings), "seconds": seconds}
+
+
+def _diagnosis(
+    qualities: Sequence[CameraQuality],
+    points: Points,
+    report: Mapping[str, Any],
+    settings: ReconSettings,
+) -> dict[str, Any]:
+    """Numbers of every camera and what they warn of, fit for JSON."""
+    told = camera_warnings(qualities)
+    rows = []
+    for quality in qualities:
+        plain = {key: _json(value) for key, value in asdict(quality).items()}
+        rows.append({**plain, "warnings": told.get(quality.name, [])})
+    footprint = points.spacing_mm / settings.voxel_px
+    warnings = scan_warnings(
+        qualities,
+        matched_share=report["matched_share"],
+        agreement_p95_mm=points.agreement_mm[1],
+        footprint_mm=footprint,
+    )
+    return {"footprint_mm": round(footprint, 4), "cameras_report": rows, "warnings": warnings}
+
+
+def _json(value: Any) -> Any:
+    """A number as JSON can hold it: four digits, null for NaN."""
+    if not isinstance(value, float):
+        return value
+    return round(value, 4) if math.isfinite(value) else None
 
 
 def _timed(seconds: dict[str, float], name: str, work: Callable[[], _Value]) -> _Value:
@@ -440,10 +474,11 @@ def _numbers(
             for pair in pairs
         ],
         "reasons": reasons,
+        "pair_reasons": [dict(pair.reasons) for pair in pairs],
         "matched_share": round(reasons["KEPT"] / max(textured, 1), 4),
         "points": len(points),
         "spacing_mm": round(points.spacing_mm, 4),
-        "agreement_median_mm": round(points.agreement_mm[0], 4),
-        "agreement_p95_mm": round(points.agreement_mm[1], 4),
+        "agreement_median_mm": _json(points.agreement_mm[0]),
+        "agreement_p95_mm": _json(points.agreement_mm[1]),
         "support_median": float(np.median(points.support)),
     }

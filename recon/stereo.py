@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from capture.arrays import Floats, Floats32, Image, Ints
+from capture.arrays import Floats, Floats32, Image
 from capture.camera import CameraArray
 from capture.errors import CameraError, SettingsError
 from recon.disparity import DisparityMap, DisparitySettings, Reason, halve, match_pair
@@ -203,14 +203,14 @@ def _search(
     margin = _MARGIN * (near - far)
     low, high = max(low - margin, far), min(high + margin, near)
     rows, columns = np.nonzero(known & (coarse >= low) & (coarse <= high))
-    landed = columns - coarse[rows, columns]
-    return _window(geometry, small, (rows, columns, landed), scale), (low * scale, high * scale)
+    found = np.stack([rows, columns, columns - coarse[rows, columns]]).astype(np.float64)
+    return _window(geometry, small, found, scale), (low * scale, high * scale)
 
 
 def _window(
     geometry: Rectification,
     small: Rectification,
-    found: tuple[Ints, Ints, Floats],
+    found: Floats,
     scale: float,
 ) -> Rectification:
     """The geometry cropped to what was found at a lower resolution, in both views."""

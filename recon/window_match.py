@@ -66,8 +66,9 @@ def known_ranges(known: Bools) -> Ints:  # pragma: no cover - compiled
 def _taps(radius: int) -> Floats32:
     """Weights (2 r + 1,) of the window along one axis, 1 in all."""
     boxes = [np.ones(r // 2 * 2 + 1) for r in (radius, radius + 1)]
-    taps = np.convolve(*boxes)
-    return (taps / taps.sum()).astype(np.float32)
+    taps: Floats32 = np.convolve(boxes[0], boxes[1]).astype(np.float32)
+    weights: Floats32 = taps / taps.sum()
+    return weights
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -267,7 +268,7 @@ def _correlate(
 def _solve_pair(
     own: Floats32, other: Floats32, target: Floats32, cross: Floats32, rest: Floats32, out: Floats32
 ) -> None:  # pragma: no cover - compiled
-    """One unknown of [[own, cross], [cross, other]] x = [target, rest]; NaN where ill-determined."""
+    """One unknown of [[own, cross], [cross, other]] x = [target, rest]; NaN where unclear."""
     for j in range(len(out)):
         determinant = own[j] * other[j] - cross[j] * cross[j]
         value = (target[j] * other[j] - rest[j] * cross[j]) / determinant

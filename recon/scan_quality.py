@@ -15,11 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from capture.arrays import Bools, Floats, Image
+from capture.arrays import Bools, Floats, Floats32, Image
 from capture.camera import Camera, CameraArray
 from recon.disparity import Reason
 from recon.fusion import Points
 from recon.images import mono
+from recon.row_offset import row_offset
 from recon.stereo import PairDepth
 
 _SAMPLES = 15_000  # points looked up, about
@@ -41,8 +42,9 @@ class CameraQuality:
         pairs: how many it is in.
         matched_share: of the textured pixels of its pairs, those matched.
         neighbours_share: the same of its partners' pairs with others.
-        deviation_px: of its pairs from the consensus of all, median of their medians.
-        deviation_mm: the same, along depth.
+        deviation_px: of its pairs from the consensus of all, along the rows and across them, median
+            of their medians.
+        deviation_mm: the part along the rows as depth.
         sharpness: of fine against coarse detail on the same skin, the middle camera's being 1.
         clipped_share: of the skin, at the greatest value the image holds.
         gain: brightness of the same skin, the middle camera's being 1.
@@ -75,7 +77,8 @@ def camera_qualities(
     """
     step = max(1, len(points) // _SAMPLES)
     world = points.positions[::step].astype(np.float64)
-    shared = [_shared(pair, world) for pair in pairs]
+    planes = [_smoothed(images[camera.name]) for camera in cameras]
+    shared = [_shared(pair, world, planes) for pair in pairs]
     seen = _seen_by(len(cameras), pairs, [entry.same for entry in shared])
     views = [
         _look(camera, images[camera.name], world, mask)
@@ -93,7 +96,7 @@ def camera_qualities(
                 pairs=len(own),
                 matched_share=_matched_share([pairs[k] for k in own]),
                 neighbours_share=_neighbours_share(index, pairs),
-                deviation_px=_median([abs(shared[k].offset_px) for k in own]),
+                deviation_px=_median([shared[k].deviation_px for k in own]),
                 deviation_mm=_median([abs(shared[k].offset_px) * shared[k].mm_per_px for k in own]),
                 sharpness=float(np.exp(focus[index])),
                 clipped_share=views[index].clipped,
@@ -108,8 +111,14 @@ class _Shared:
     """A pair at the sampled points: where it sees the same surface, and how far off it is."""
 
     same: Bools  # (N,)
-    offset_px: float
+    offset_px: float  # along the rows
+    row_px: float  # across them
     mm_per_px: float
+
+    @property
+    def deviation_px(self) -> float:
+        """How far off it is, in any direction."""
+        return float(np.hypot(self.offset_px, np.nan_to_num(self.row_px)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,8 +131,8 @@ class _View:
     clipped: float
 
 
-def _shared(pair: PairDepth, world: Floats) -> _Shared:
-    nothing = _Shared(np.zeros(len(world), np.bool_), np.nan, np.nan)
+def _shared(pair: PairDepth, world: Floats, planes: Sequence[Floats32]) -> _Shared:
+    nothing = _Shared(np.zeros(len(world), np.bool_), np.nan, np.nan, np.nan)
     if pair.view is None:
         return nothing
     geometry = pair.view.geometry
@@ -138,7 +147,12 @@ def _shared(pair: PairDepth, world: Floats) -> _Shared:
         return nothing
     depth = float(np.median(front[same, 2]))
     mm_per_px = depth * depth / (geometry.focal_px * geometry.baseline_mm)
-    return _Shared(same, float(np.median(offset[same])), mm_per_px)
+    row_px = row_offset(pair.view, planes[pair.pair.left], planes[pair.pair.right])
+    return _Shared(same, float(np.median(offset[same])), row_px, mm_per_px)
+
+
+def _smoothed(image: Image) -> Floats32:
+    return np.asarray(cv2.GaussianBlur(mono(image), (0, 0), _FINE), dtype=np.float32)
 
 
 def _seen_by(count: int, pairs: Sequence[PairDepth], same: Sequence[Bools]) -> list[Bools]:

@@ -12,12 +12,14 @@ import json
 import os
 import subprocess
 import sys
+import time
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, fields
 from pathlib import Path
 from queue import Empty, SimpleQueue
+from threading import Lock
 from types import TracebackType
-from typing import IO, Any
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +29,13 @@ from recon.fusion import Points
 from recon.surface import Scan, SurfaceSettings, poisson_scan
 
 _SERVE = "from recon.mesh_process import serve; serve()"
+
+
+class Meshed(NamedTuple):
+    """A mesh and the seconds of wall clock it took."""
+
+    scan: Scan
+    seconds: float
 
 
 class Mesher:
@@ -41,6 +50,8 @@ class Mesher:
         self._settings = settings
         self._threads = ThreadPoolExecutor(processes) if processes else None
         self._children: list[_Child] = []
+        self._left = False
+        self._door = Lock()  # no process is started once it is left
         self._idle: SimpleQueue[_Child] = SimpleQueue()
 
     def __enter__(self) -> Mesher:
@@ -52,31 +63,44 @@ class Mesher:
         error: BaseException | None,
         at: TracebackType | None,
     ) -> None:
-        for child in self._children:
-            child.stop()
-        if self._threads is not None:
-            self._threads.shutdown(wait=True, cancel_futures=True)
+        if self._threads is None:
+            return
+        self._threads.shutdown(wait=False, cancel_futures=True)
+        with self._door:
+            self._left = True
+            for child in self._children:
+                child.stop()
+        self._threads.shutdown(wait=True)
 
-    def submit(self, points: Points) -> Future[Scan]:
+    def submit(self, points: Points) -> Future[Meshed]:
         """Have points meshed; the future raises SolveError when there is no surface."""
         if self._threads is not None:
             return self._threads.submit(self._asked, points)
-        done: Future[Scan] = Future()
+        done: Future[Meshed] = Future()
+        start = time.perf_counter()
         try:
-            done.set_result(poisson_scan(points, self._settings))
+            scan = poisson_scan(points, self._settings)
+            done.set_result(Meshed(scan, time.perf_counter() - start))
         except SolveError as error:
             done.set_exception(error)
         return done
 
-    def _asked(self, points: Points) -> Scan:
+    def _asked(self, points: Points) -> Meshed:
+        start = time.perf_counter()
         try:
             child = self._idle.get_nowait()
         except Empty:
-            child = _Child(self._settings)
-            self._children.append(child)
+            child = self._started()
         scan = child.mesh(points)
         self._idle.put(child)
-        return scan
+        return Meshed(scan, time.perf_counter() - start)
+
+    def _started(self) -> _Child:
+        with self._door:
+            if self._left:
+                raise SolveError("interrupted before the mesh was made")
+            self._children.append(_Child(self._settings))
+            return self._children[-1]
 
 
 def serve() -> None:

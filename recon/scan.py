@@ -32,7 +32,7 @@ from capture.take import Take
 from recon.depth_maps import write_depth_maps
 from recon.disparity import DisparitySettings, Reason
 from recon.fusion import FusionSettings, Points, fuse
-from recon.mesh_process import Mesher
+from recon.mesh_process import Meshed, Mesher
 from recon.pairs import PairSettings
 from recon.point_file import is_points_file, points_scan
 from recon.prior import PriorMesh, PriorMeshes
@@ -251,7 +251,7 @@ class _Waiting(NamedTuple):
     frame: int
     points: Points
     report: dict[str, Any]
-    scan: Future[Scan] | None
+    scan: Future[Meshed] | None
 
 
 class _Run:
@@ -322,11 +322,14 @@ class _Run:
     def _finish(self) -> None:
         """Write the frame that was started first."""
         frame, points, report, meshed = self._waiting.popleft()
-        try:
-            scan = points_scan(points) if meshed is None else meshed.result()
-        except SolveError as error:
-            self._fail(frame, error)
-            return
+        scan = points_scan(points)
+        if meshed is not None:
+            try:
+                scan, seconds = meshed.result()
+            except SolveError as error:
+                self._fail(frame, error)
+                return
+            report["seconds"]["mesh"] = round(seconds, 3)
         report["vertices"], report["triangles"] = len(scan.vertices), len(scan.triangles)
         path = self.path(frame)
         with replacing(path.with_suffix(".json")) as partial:

@@ -10,8 +10,8 @@ from recon.scan_quality import CameraQuality
 
 # Thresholds. On rendered takes without faults deviations stay below 0.03 px, sharpness within 0.9
 # to 1.1, gain within 0.92 to 1.06; a blur of 1.2 px gives 0.74, an image shifted by 0.3 px 0.27.
-DEVIATION_PX = 0.08
-_ABOVE_OTHERS = 3.0  # a deviation is one camera's own when it is this many times the others'
+_DEVIATION_PX = 0.08
+_ABOVE_OTHERS = 2.0  # a deviation is one camera's own when it is this many times the others'
 _SHARPNESS = 0.82
 _CLIPPED = 0.03  # share of the skin
 _GAIN = 0.2  # of darker or brighter
@@ -81,7 +81,8 @@ def _shared_faults(qualities: Sequence[CameraQuality]) -> list[str]:
             f"{len(clipped)} of {len(qualities)} cameras: {_percent(float(np.median(clipped)))} of "
             "the skin is at white: lower the light, the exposure or the gain"
         )
-    off = [quality.deviation_px for quality in qualities if quality.deviation_px > DEVIATION_PX]
+    rest = [quality for quality in qualities if not _is_off(quality, qualities)]
+    off = [quality.deviation_px for quality in rest if quality.deviation_px > _DEVIATION_PX]
     if len(off) > len(qualities) / 2:
         out.append(
             f"{len(off)} of {len(qualities)} cameras: pairs lie {float(np.median(off)):.2f} px off "
@@ -94,12 +95,7 @@ def _is_off(one: CameraQuality, all_: Sequence[CameraQuality]) -> bool:
     others = [quality.deviation_px for quality in all_ if quality.name != one.name]
     known = [value for value in others if np.isfinite(value)]
     typical = float(np.median(known)) if known else 0.0
-    return one.deviation_px > max(DEVIATION_PX, _ABOVE_OTHERS * typical)
-
-
-def _is_off_anyway(one: CameraQuality, all_: Sequence[CameraQuality]) -> bool:
-    many = sum(quality.deviation_px > DEVIATION_PX for quality in all_) > len(all_) / 2
-    return not many and _is_off(one, all_)
+    return one.deviation_px > max(_DEVIATION_PX, _ABOVE_OTHERS * typical)
 
 
 def _off(one: CameraQuality) -> str:
@@ -151,7 +147,7 @@ def _percent(share: float) -> str:
 _Fault = Callable[[CameraQuality, Sequence[CameraQuality]], bool]
 _FAULTS: tuple[tuple[_Fault, Callable[[CameraQuality], str]], ...] = (
     (lambda one, _: not np.isfinite(one.deviation_px), _lost),
-    (_is_off_anyway, _off),
+    (_is_off, _off),
     (lambda one, _: one.sharpness < _SHARPNESS, _blurred),
     (lambda one, _: one.clipped_share > _CLIPPED, _clipped),
     (lambda one, _: one.gain < 1 - _GAIN or one.gain > 1 / (1 - _GAIN), _unequal),

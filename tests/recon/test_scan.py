@@ -68,7 +68,10 @@ def test_the_numbers_say_how_it_went(result):
     report = result.report
     assert report["points"] == len(result.points)
     assert 0 < report["agreement_median_mm"] < report["agreement_p95_mm"] < 2.0
-    assert set(report["seconds"]) == {"match", "fuse", "mesh"}
+    assert set(report["seconds"]) == {"match", "fuse", "quality", "mesh"}
+    assert [row["name"] for row in report["cameras_report"]] == report["cameras"]
+    assert len(report["pair_reasons"]) == len(report["pairs"])
+    assert report["warnings"] == []
     assert all(9 <= pair["angle_deg"] <= 27 for pair in report["pairs"])
     json.dumps(report)
 

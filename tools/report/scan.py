@@ -32,6 +32,7 @@ _FACTS = {
     "matched_share": "share of textured pixels matched",
     "support_median": "pairs behind a point, median",
 }
+_PAIRS = ("left", "right", "angle, degrees", "share matched")
 _COLUMNS = {
     "name": "device",
     "pairs": "pairs",
@@ -202,6 +203,9 @@ def _section(entry: _Frame, cameras: CameraArray) -> Section:
     if pairs:
         caption = "Share of each pair's crop that was matched, percent; red matched nothing."
         parts.append(figure(coverage_matrix(names, pairs), caption))
+        head = ["left", "right", "angle_deg", "coverage"]
+        rows = [[_value(pair, key) for key in head] for pair in pairs]
+        parts.append(folded(f"{len(pairs)} pairs with their angles", table(_PAIRS, rows)))
     reasons = [counts for counts in told.get("pair_reasons", []) if isinstance(counts, Mapping)]
     if pairs and reasons:
         caption = "What became of the pixels of each device's pairs; the number is what matched."

@@ -36,11 +36,12 @@ def coverage_matrix(names: Sequence[str], pairs: Sequence[Mapping[str, Any]]) ->
     place = {name: index for index, name in enumerate(names)}
     colours = stops("sequential", 11)
     left, top = 20.0 + 7.2 * max((len(name) for name in names), default=4), 24.0
+    same = _shared_beginning(names)
     parts = []
     for index, name in enumerate(names):
         middle = _CELL * (index + 0.62)
         parts.append(text(left - 8, top + middle, name, class_="tick", text_anchor="end"))
-        short = name if len(name) <= 5 else f"{name[:1]}{name[-3:]}"
+        short = name[same:][-4:] or name[-4:]
         parts.append(
             text(left + _CELL * (index + 0.5), 16, short, class_="tick", text_anchor="middle")
         )
@@ -68,6 +69,13 @@ def coverage_matrix(names: Sequence[str], pairs: Sequence[Mapping[str, Any]]) ->
     size = _CELL * len(names)
     title = "coverage of pairs, percent"
     return drawing(max(left + size + 10, 240.0), top + size + 8, "".join(parts), title)
+
+
+def _shared_beginning(names: Sequence[str]) -> int:
+    """How many letters all names begin with alike."""
+    letters = list(zip(*names, strict=False)) if len(names) > 1 else []
+    alike = [len(set(column)) == 1 for column in letters]
+    return alike.index(False) if False in alike else len(alike)
 
 
 def reason_bars(

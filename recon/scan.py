@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
-
-import numpy as np
 
 from capture.arrays import Image
 from capture.camera import CameraArray
@@ -30,15 +27,14 @@ from capture.progress import Progress, silent
 from capture.settings import check_range
 from capture.take import Take
 from recon.depth_maps import write_depth_maps
-from recon.disparity import DisparitySettings, Reason
+from recon.disparity import DisparitySettings
 from recon.fusion import FusionSettings, Points, fuse
 from recon.mesh_process import Meshed, Mesher
 from recon.pairs import PairSettings
 from recon.point_file import is_points_file, points_scan
 from recon.prior import PriorMesh, PriorMeshes
-from recon.scan_quality import CameraQuality, camera_qualities
-from recon.scan_warnings import camera_warnings, missing_warnings, scan_warnings
-from recon.stereo import PairDepth, StereoSettings, match_views
+from recon.scan_numbers import scan_numbers
+from recon.stereo import StereoSettings, match_views
 from recon.surface import Scan, SurfaceSettings, poisson_scan, read_ply, write_ply
 
 _Value = TypeVar("_Value")
@@ -301,9 +297,9 @@ class _Run:
         """Match a frame and have it meshed."""
         take = self._take
         names = [name for name in take.device_names if take.present(name, frame)]
-        missing = [name for name in take.device_names if name not in names]
         try:
             if len(names) < 2:
+                missing = [name for name in take.device_names if name not in names]
                 raise TakeError(
                     f"{take.folder}: frame {frame} has {len(names)} views; stereo needs at "
                     f"least 2; lost: {', '.join(missing)}"
@@ -314,8 +310,7 @@ class _Run:
         except (SolveError, InputError) as error:
             self._fail(frame, error)
             return
-        report = {"frame": frame, "missing": missing, **report}
-        report["warnings"] = [*missing_warnings(missing), *report["warnings"]]
+        report = {"frame": frame, **report}
         scan = mesher.submit(points) if self._settings.mesh else None
         self._waiting.append(_Waiting(frame, points, report, scan))
 
@@ -414,38 +409,12 @@ def _matched(
             f"nothing found: {len(points)} points are seen alike by {len(pairs)} pairs; "
             "are the cameras those of this take?"
         )
-    report = _numbers(there, pairs, points)
-    qualities = _timed(seconds, "quality", lambda: camera_qualities(there, images, pairs, points))
-    return points, {**report, **_diagnosis(qualities, points, report, settings), "seconds": seconds}
-
-
-def _diagnosis(
-    qualities: Sequence[CameraQuality],
-    points: Points,
-    report: Mapping[str, Any],
-    settings: ReconSettings,
-) -> dict[str, Any]:
-    """Numbers of every camera and what they warn of, fit for JSON."""
-    told = camera_warnings(qualities)
-    rows = []
-    for quality in qualities:
-        plain = {key: _json(value) for key, value in asdict(quality).items()}
-        rows.append({**plain, "warnings": told.get(quality.name, [])})
-    footprint = points.spacing_mm / settings.voxel_px
-    warnings = scan_warnings(
-        qualities,
-        matched_share=report["matched_share"],
-        agreement_p95_mm=points.agreement_mm[1],
-        footprint_mm=footprint,
+    numbers = _timed(
+        seconds,
+        "quality",
+        lambda: scan_numbers(cameras, images, pairs, points, points.spacing_mm / settings.voxel_px),
     )
-    return {"footprint_mm": round(footprint, 4), "cameras_report": rows, "warnings": warnings}
-
-
-def _json(value: Any) -> Any:
-    """A number as JSON can hold it: four digits, null for NaN."""
-    if not isinstance(value, float):
-        return value
-    return round(value, 4) if math.isfinite(value) else None
+    return points, {**numbers, "seconds": seconds}
 
 
 def _timed(seconds: dict[str, float], name: str, work: Callable[[], _Value]) -> _Value:
@@ -453,35 +422,3 @@ def _timed(seconds: dict[str, float], name: str, work: Callable[[], _Value]) -> 
     value = work()
     seconds[name] = round(time.perf_counter() - start, 3)
     return value
-
-
-def _numbers(
-    cameras: CameraArray,
-    pairs: Sequence[PairDepth],
-    points: Points,
-) -> dict[str, Any]:
-    """What a reader wants to know of a scan, fit for JSON."""
-    reasons = {
-        reason.name: sum(pair.reasons.get(reason.name, 0) for pair in pairs) for reason in Reason
-    }
-    textured = sum(reasons.values()) - reasons["OUTSIDE"] - reasons["NO_TEXTURE"]
-    return {
-        "cameras": list(cameras.names),
-        "pairs": [
-            {
-                "left": cameras[pair.pair.left].name,
-                "right": cameras[pair.pair.right].name,
-                "angle_deg": round(pair.pair.angle_deg, 2),
-                "coverage": round(pair.coverage, 4),
-            }
-            for pair in pairs
-        ],
-        "reasons": reasons,
-        "pair_reasons": [dict(pair.reasons) for pair in pairs],
-        "matched_share": round(reasons["KEPT"] / max(textured, 1), 4),
-        "points": len(points),
-        "spacing_mm": round(points.spacing_mm, 4),
-        "agreement_median_mm": _json(points.agreement_mm[0]),
-        "agreement_p95_mm": _json(points.agreement_mm[1]),
-        "support_median": float(np.median(points.support)),
-    }

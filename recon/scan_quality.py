@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.spatial import cKDTree
 
 from capture.arrays import Bools, Floats, Floats32, Image
 from capture.camera import Camera, CameraArray
@@ -25,11 +26,14 @@ from recon.stereo import PairDepth
 
 _SAMPLES = 15_000  # points looked up, about
 _SAME_PX = 2.5  # a pair farther than this from the consensus sees another surface there
+_STRAYS = 1000  # matched pixels of a pair that are looked for in the scan, about
+_CONFIRMED = 2.5  # spacings of points within which a matched pixel lies on the scan
 _LEAST = 50  # points that a pair must share with the consensus to be counted
 _FINE, _MIDDLE, _COARSE = 0.8, 1.6, 4.0  # px, scales between which sharpness is measured
 _WHITES = (1023, 4095, 16383, 65535)  # of 16-bit files with fewer bits in them
 _NEAR_WHITE = 0.985
 _PLATEAU = 0.005  # share of the skin at its brightest value from which that is a limit
+_CELLS = 56  # of the longer side of what a view sees of the skin
 _CLOSE = 12  # holes in the skin up to a twelfth of the view are skin
 
 
@@ -41,6 +45,8 @@ class CameraQuality:
         name: of the device.
         pairs: how many it is in.
         matched_share: of the textured pixels of its pairs, those matched.
+        unconfirmed_share: of those matched, the ones with no surface of the scan near them.
+        covered_share: of the skin it sees, that of which its pairs measured something.
         neighbours_share: the same of its partners' pairs with others.
         deviation_px: of its pairs from the consensus of all, along the rows and across them, median
             of their medians.
@@ -54,6 +60,8 @@ class CameraQuality:
     pairs: int
     matched_share: float
     neighbours_share: float
+    unconfirmed_share: float
+    covered_share: float
     deviation_px: float
     deviation_mm: float
     sharpness: float
@@ -84,6 +92,7 @@ def camera_qualities(
         _look(camera, images[camera.name], world, mask)
         for camera, mask in zip(cameras, seen, strict=True)
     ]
+    stray = _unconfirmed(pairs, points)
     both = list(zip(pairs, shared, strict=True))
     gains = _balanced(pairs, [_brightness(pair, entry, views) for pair, entry in both], len(views))
     focus = _balanced(pairs, [_detail(pair, entry, views) for pair, entry in both], len(views))
@@ -96,6 +105,8 @@ def camera_qualities(
                 pairs=len(own),
                 matched_share=_matched_share([pairs[k] for k in own]),
                 neighbours_share=_neighbours_share(index, pairs),
+                unconfirmed_share=_median([stray[k] for k in own]),
+                covered_share=views[index].covered,
                 deviation_px=_median([shared[k].deviation_px for k in own]),
                 deviation_mm=_median([abs(shared[k].offset_px) * shared[k].mm_per_px for k in own]),
                 sharpness=float(np.exp(focus[index])),
@@ -129,6 +140,7 @@ class _View:
     fine: Floats  # (N,) detail of the finest scale
     coarse: Floats  # (N,) detail a few times coarser
     clipped: float
+    covered: float
 
 
 def _shared(pair: PairDepth, world: Floats, planes: Sequence[Floats32]) -> _Shared:
@@ -173,26 +185,28 @@ def _look(camera: Camera, image: Image, world: Floats, seen: Bools) -> _View:
     known = np.isfinite(pixels[:, 0])
     if known.sum() < _LEAST:
         nan = np.full(len(world), np.nan)
-        return _View(nan, nan, nan, 0.0)
+        return _View(nan, nan, nan, 0.0, 0.0)
     low = np.maximum(np.floor(np.nanmin(pixels, axis=0)).astype(int) - 16, 0)
     high = np.ceil(np.nanmax(pixels, axis=0)).astype(int) + 17
     part = image[low[1] : high[1], low[0] : high[0]]
     grey = mono(part)
     blurred = [cv2.GaussianBlur(grey, (0, 0), sigma) for sigma in (_FINE, _MIDDLE, _COARSE)]
     at = (pixels[:, 0] - low[0], pixels[:, 1] - low[1])
+    clipped, covered = _skin_shares(part, pixels[known] - low)
     return _View(
         level=_looked_up(blurred[1], *at),
         fine=_looked_up(blurred[0] - blurred[1], *at),
         coarse=_looked_up(blurred[1] - blurred[2], *at),
-        clipped=_clipped(part, pixels[known] - low),
+        clipped=clipped,
+        covered=covered,
     )
 
 
-def _clipped(part: Image, pixels: Floats) -> float:
-    """Share of the skin around the points (N, 2) that lies at the greatest value there is."""
+def _skin_shares(part: Image, pixels: Floats) -> tuple[float, float]:
+    """Of the skin around the points (N, 2), the share at the greatest value, and the share hit."""
     top = part.max(axis=2) if part.ndim == 3 else part
     height, width = top.shape
-    step = max(1, max(height, width) // 128)
+    step = max(3, max(height, width) // _CELLS)
     mask = np.zeros((height // step + 1, width // step + 1), np.uint8)
     column, row = np.rint(pixels / step).astype(int).T
     mask[np.minimum(row, mask.shape[0] - 1), np.minimum(column, mask.shape[1] - 1)] = 1
@@ -201,11 +215,10 @@ def _clipped(part: Image, pixels: Floats) -> float:
     skin = cv2.morphologyEx(np.pad(mask, size), cv2.MORPH_CLOSE, round_)[size:-size, size:-size]
     whole = np.kron(skin, np.ones((step, step), np.uint8))[:height, :width] > 0
     values = top[whole]
-    if len(values) == 0:
-        return 0.0
     plateau = float((values == values.max()).mean())
     white = float((values >= _NEAR_WHITE * _white(top)).mean())
-    return max(white, plateau if plateau > _PLATEAU else 0.0)
+    covered = float(mask.sum() / max(int(skin.sum()), 1))
+    return max(white, plateau if plateau > _PLATEAU else 0.0), covered
 
 
 def _white(image: Image) -> float:
@@ -283,6 +296,25 @@ def _neighbours_share(index: int, pairs: Sequence[PairDepth]) -> float:
 def _median(values: Sequence[float]) -> float:
     known = [value for value in values if np.isfinite(value)]
     return float(np.median(known)) if known else float("nan")
+
+
+def _unconfirmed(pairs: Sequence[PairDepth], points: Points) -> list[float]:
+    """Of each pair's matched pixels, the share with no point of the scan within a few spacings."""
+    tree = cKDTree(points.positions)
+    reach = _CONFIRMED * points.spacing_mm
+    out = []
+    for pair in pairs:
+        if pair.view is None:
+            out.append(float("nan"))
+            continue
+        rows, columns = np.nonzero(np.isfinite(pair.view.disparity))
+        step = max(1, len(rows) // _STRAYS)
+        rows, columns = rows[::step], columns[::step]
+        values = pair.view.disparity[rows, columns].astype(np.float64)
+        world = pair.view.geometry.triangulate(np.stack([columns, rows, values], axis=1))
+        away = np.asarray(tree.query(world, distance_upper_bound=reach)[0])
+        out.append(float(np.isinf(away).mean()))
+    return out
 
 
 def _looked_up(plane: NDArray[Any], column: Floats, row: Floats) -> Floats:

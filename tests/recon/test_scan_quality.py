@@ -52,6 +52,8 @@ def test_a_good_array_is_left_in_peace(images, clean):
         assert 0.97 < one.gain < 1.03
         assert one.clipped_share < 0.01
         assert one.pairs >= 2
+        assert one.unconfirmed_share < 0.1
+        assert one.covered_share > 0.9
     assert judged(ARRAY, images, clean) == found
 
 
@@ -110,7 +112,8 @@ def test_a_device_that_sees_something_else_is_named(images):
 
 
 GOOD = CameraQuality(
-    name="a", pairs=4, matched_share=0.5, neighbours_share=0.5, deviation_px=0.01,
+    name="a", pairs=4, matched_share=0.5, neighbours_share=0.5, unconfirmed_share=0.1,
+    covered_share=0.9, deviation_px=0.01,
     deviation_mm=0.01, sharpness=1.0, clipped_share=0.0, gain=1.0,
 )  # fmt: skip
 

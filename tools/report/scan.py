@@ -31,12 +31,16 @@ _FACTS = {
     "footprint_mm": "a pixel covers, mm",
     "matched_share": "share of textured pixels matched",
     "support_median": "pairs behind a point, median",
+    "lone_share": "points that one pair alone saw, share",
+    "unconfirmed_share": "matched pixels off the scan, share",
 }
 _PAIRS = ("left", "right", "angle, degrees", "share matched")
 _COLUMNS = {
     "name": "device",
     "pairs": "pairs",
     "matched_share": "matched",
+    "unconfirmed_share": "off the scan",
+    "covered_share": "skin covered",
     "deviation_px": "off the others, px",
     "deviation_mm": "as depth, mm",
     "sharpness": "sharpness",

@@ -314,7 +314,8 @@ def _semi_global(count: int, block: int, mode: int) -> Any:
 
 def _ready_made(case: PairCase, create: Callable[[int, int], Any]) -> Floats32:
     block = 15 if create is cv2.StereoBM.create else _BLOCK
-    low, count, left, right, pad = _eight_bit(case)
+    low, count, left, right = _eight_bit(case)
+    pad = left.shape[1] - case.left.shape[1] - max(-low, 0)
     matcher = create(count, block)
     matcher.setMinDisparity(low)
     raw = matcher.compute(left, right)[:, pad : pad + case.left.shape[1]]
@@ -325,7 +326,8 @@ def _ready_made(case: PairCase, create: Callable[[int, int], Any]) -> Floats32:
 
 def _filtered(case: PairCase) -> Floats32:
     """SGBM 3WAY under the weighted least-squares filter, as OpenCV's sample has it."""
-    low, count, left, right, pad = _eight_bit(case)
+    low, count, left, right = _eight_bit(case)
+    pad = left.shape[1] - case.left.shape[1] - max(-low, 0)
     matcher = _semi_global(count, _BLOCK, cv2.STEREO_SGBM_MODE_SGBM_3WAY)
     matcher.setMinDisparity(low)
     smooth = cv2.ximgproc.createDisparityWLSFilter(matcher)
@@ -340,16 +342,16 @@ def _filtered(case: PairCase) -> Floats32:
     return np.asarray(found, dtype=np.float32)
 
 
-def _eight_bit(case: PairCase) -> tuple[int, int, NDArray[np.uint8], NDArray[np.uint8], int]:
-    """Least disparity, number of them, both views in 8 bits with room at the sides, that room."""
+def _eight_bit(case: PairCase) -> tuple[int, int, NDArray[np.uint8], NDArray[np.uint8]]:
+    """Least disparity, number of them, and both views in 8 bits with room for them at the sides."""
     low = int(np.floor(case.limits_px[0]))
     count = int(np.ceil((case.limits_px[1] + 1 - low) / 16.0)) * 16
-    pad = max(low + count, -low, 0)
+    room = max(low + count, 0), max(-low, 0)
     views = []
     for view in (case.left, case.right):
         grey = np.rint(255.0 * np.nan_to_num(view)).clip(0, 255).astype(np.uint8)
-        views.append(cv2.copyMakeBorder(grey, 0, 0, pad, pad, cv2.BORDER_REPLICATE))
-    return low, count, views[0], views[1], pad
+        views.append(cv2.copyMakeBorder(grey, 0, 0, *room, cv2.BORDER_REPLICATE))
+    return low, count, views[0], views[1]
 
 
 if __name__ == "__main__":

@@ -31,12 +31,19 @@ def depth_map(camera: Camera, vertices: Floats | Floats32, triangles: Ints32) ->
     return _cast(camera, SurfaceQuery(vertices, triangles), vertices)
 
 
+def depth_maps(
+    cameras: Iterable[Camera], vertices: Floats | Floats32, triangles: Ints32
+) -> dict[str, Floats32]:
+    """Depth maps of one mesh in several views, by the camera's name; see `depth_map`."""
+    query = SurfaceQuery(vertices, triangles)
+    return {camera.name: _cast(camera, query, vertices) for camera in cameras}
+
+
 def write_depth_maps(
     path: Path, cameras: Iterable[Camera], vertices: Floats | Floats32, triangles: Ints32
 ) -> None:
     """Write the depth maps of a mesh, one array a camera by its name, 0 where there is nothing."""
-    query = SurfaceQuery(vertices, triangles)
-    maps = {camera.name: _cast(camera, query, vertices) for camera in cameras}
+    maps = depth_maps(cameras, vertices, triangles)
     write_archive(path, {name: np.nan_to_num(depth, nan=0.0) for name, depth in maps.items()})
 
 

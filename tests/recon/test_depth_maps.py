@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from capture.errors import ShapeError
-from recon.depth_maps import depth_map, read_depth_maps, write_depth_maps
+from recon.depth_maps import depth_map, depth_maps, read_depth_maps, write_depth_maps
 from tests.recon.test_prior import sphere, square
 from tests.synthetic_stereo import RADII_MM, hit, ring
 
@@ -71,7 +71,7 @@ def test_the_file_holds_a_map_a_camera(tmp_path):
     write_depth_maps(path, CAMERAS, *mesh)
     first = path.read_bytes()
     found = read_depth_maps(path, CAMERAS)
-    assert list(found) == list(CAMERAS.names)
+    assert list(found) == list(depth_maps(CAMERAS, *mesh)) == list(CAMERAS.names)
     for camera in CAMERAS:
         np.testing.assert_array_equal(found[camera.name], depth_map(camera, *mesh))
     write_depth_maps(path, CAMERAS, *mesh)

@@ -8,7 +8,7 @@ import numpy as np
 
 from capture.arrays import Floats, Floats32
 from capture.camera import Camera, CameraArray
-from recon.depth_maps import depth_map
+from recon.depth_maps import depth_maps
 from recon.mesh import Mesh
 from recon.surface import Scan
 from tools.report.charts import colour_scale
@@ -48,12 +48,13 @@ def depth_thumbnails(scan: Scan, cameras: CameraArray) -> str:
     """The depth of the mesh in each camera, near bright and far dark; empty without a mesh."""
     if len(scan.triangles) == 0:
         return ""
-    maps = []
-    for camera in cameras:
-        small = enlarged(camera, min(1.0, _THUMB / max(camera.width, camera.height)))
-        maps.append(depth_map(small, scan.vertices, scan.triangles))
+    small = [
+        enlarged(camera, min(1.0, _THUMB / max(camera.width, camera.height))) for camera in cameras
+    ]
+    maps = depth_maps(small, scan.vertices, scan.triangles)
     figures = []
-    for camera, depth in zip(cameras, maps, strict=True):
+    for camera in cameras:
+        depth = maps[camera.name]
         known = depth[np.isfinite(depth)]
         low, high = np.percentile(known, [1, 99]).tolist() if len(known) else (0.0, 1.0)
         words = f"{camera.name}: {low:.0f} to {high:.0f} mm" if len(known) else "sees nothing of it"

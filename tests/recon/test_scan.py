@@ -93,6 +93,15 @@ def test_gain_and_depth_of_the_devices_do_not_matter(images, result):
     assert np.median(np.abs(distance(scan.vertices.astype(np.float64)))) < 0.2
 
 
+def test_devices_that_lost_a_frame_are_named(images, result):
+    left = {name: image for name, image in images.items() if name not in ("cam00", "cam04")}
+    found = reconstruct_images(ARRAY, left, SMALL)
+    assert found.report["missing"] == ["cam00", "cam04"]
+    assert found.report["warnings"][0].startswith("cam00, cam04: no image of this frame")
+    assert len(found.points) < len(result.points)
+    assert np.median(np.abs(distance(found.scan.vertices.astype(np.float64)))) < 0.2
+
+
 def test_a_take_is_scanned_frame_by_frame_and_resumed(tmp_path, images):
     take = import_take(_visit(tmp_path, images), tmp_path / "take")
     told: list[tuple[int, int, str]] = []

@@ -6,16 +6,21 @@ import re
 from html.parser import HTMLParser
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
+from capture.camera_file import write_cameras
 from capture.errors import TakeError
 from capture.take import Take
 from recon.fusion import Points
 from recon.mesh import write_obj
 from recon.point_file import points_scan
 from recon.surface import write_ply
+from recon.visiting import import_take
+from tests.synthetic_stereo import draw, ring
 from tests.tools import report_cases as cases
+from tools.cli import main
 from tools.report.charts import Labels
 from tools.report.scan import write_scan_report
 from tools.report.scan_charts import coverage_matrix, reason_bars, stacked_chart
@@ -187,3 +192,33 @@ def test_a_prior_is_a_performance_or_a_mesh(take: Take, tmp_path: Path):
     np.testing.assert_allclose(one.vertices, cases.ball().vertices, atol=1e-4)
     with pytest.raises(TakeError, match=r"face\.ply: expected the performance\.npz"):
         read_prior(tmp_path / "face.ply")
+
+
+def test_the_verb_keeps_the_good_frames_and_shows_them(tmp_path: Path, capfd):
+    array = ring((-9.0, 9.0), (-9.0, 9.0))
+    for camera in array:
+        folder = tmp_path / "visit" / camera.name
+        folder.mkdir(parents=True)
+        image = np.rint(65535 * draw(camera)).astype(np.uint16)
+        cv2.imwrite(str(folder / "0000.png"), image)
+        cv2.imwrite(str(folder / "0001.png"), np.full_like(image, 7))
+    write_cameras(tmp_path / "visit" / "cameras.json", array)
+    import_take(tmp_path / "visit", tmp_path / "take")
+    options = ["--depth-mm", "90", "--extent-mm", "110", "--depth-maps"]
+    assert main(["recon", str(tmp_path / "take"), *options]) == 1
+    told = capfd.readouterr().err
+    assert "1 of 2 frames failed, the others are done" in told
+    assert "frame 1: nothing found" in told
+    folder = tmp_path / "take" / "products" / "recon"
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    assert "Frame 1:" in page
+    assert "scan from the front" in page
+    assert sorted(path.name for path in folder.iterdir()) == [
+        "depth", "frame_0000.json", "frame_0000.ply", "frame_0000.ply.record.json", "report.html",
+    ]  # fmt: skip
+    assert main(["recon", str(tmp_path / "take"), "--frames", "0", "--json", *options]) == 0
+    report = json.loads(capfd.readouterr().out)
+    assert report["page"].endswith("report.html")
+    assert report["warnings"] == []
+    assert main(["recon", str(tmp_path / "take"), "--prior", "face.ply"]) == 2
+    assert "expected the performance.npz" in capfd.readouterr().err

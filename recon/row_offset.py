@@ -60,10 +60,17 @@ def row_offset(view: DepthView, left: Floats32, right: Floats32) -> float:
 
 def _places(view: DepthView) -> tuple[Ints, Ints]:
     """Rows and columns (N,) of windows whose disparities are all known, spread evenly."""
-    size = 2 * _RADIUS + 1
-    known = np.isfinite(view.disparity)
-    whole = ndimage.minimum_filter(known, size=size, mode="constant", cval=0)
-    rows, columns = np.nonzero(whole)
+    height, width = view.disparity.shape
+    stride = max(1, int(np.sqrt(height * width / (8 * _WINDOWS))))
+    rows, columns = np.nonzero(np.isfinite(view.disparity[::stride, ::stride]))
+    rows, columns = rows * stride, columns * stride
+    inside = (rows >= _RADIUS) & (rows < height - _RADIUS)
+    inside &= (columns >= _RADIUS) & (columns < width - _RADIUS)
+    rows, columns = rows[inside], columns[inside]
+    reach = np.arange(-_RADIUS, _RADIUS + 1)
+    window = view.disparity[rows[:, None, None] + reach[:, None], columns[:, None, None] + reach]
+    whole = np.isfinite(window).all(axis=(1, 2))
+    rows, columns = rows[whole], columns[whole]
     step = max(1, len(rows) // _WINDOWS)
     return rows[step // 2 :: step], columns[step // 2 :: step]
 

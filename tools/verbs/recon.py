@@ -26,6 +26,7 @@ from tools.verbs.options import Options, parse_frames
 from track.performance import read_performance
 
 REQUIRED = ("take",)
+_SMALLEST_MM, _LARGEST_MM = 20.0, 5000.0  # of a prior mesh: metres and inches are not taken for mm
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,11 +70,11 @@ def read_prior(path: Path) -> PriorMeshes:
     """Read meshes to look near to: a performance (.npz), or one mesh (.obj) for all frames.
 
     Raises:
-        TakeError: when the file is neither, or cannot be read.
+        InputError: when the file is neither, cannot be read, or is not in mm.
     """
     if path.suffix.lower() == ".obj":
         mesh = read_obj(path)
-        return _meshes([0], mesh.vertices[None], mesh)
+        return _meshes(path, [0], mesh.vertices[None], mesh)
     if path.suffix.lower() != ".npz":
         raise TakeError(
             f"{path}: expected the performance.npz that `likeness track` wrote, or an .obj mesh"
@@ -82,10 +83,15 @@ def read_prior(path: Path) -> PriorMeshes:
     order = np.argsort(tracked.frames, kind="stable")
     vertices = tracked.vertices[order]
     mesh = Mesh(vertices[0].astype(np.float64), tracked.polygons)
-    return _meshes(tracked.frames[order].tolist(), vertices, mesh)
+    return _meshes(path, tracked.frames[order].tolist(), vertices, mesh)
 
 
-def _meshes(frames: Sequence[int], vertices: Any, mesh: Mesh) -> PriorMeshes:
+def _meshes(path: Path, frames: Sequence[int], vertices: Any, mesh: Mesh) -> PriorMeshes:
+    size = float(np.ptp(vertices[0], axis=0).max())
+    if not _SMALLEST_MM <= size <= _LARGEST_MM:
+        raise TakeError(
+            f"{path}: expected a face or head in world mm, found a mesh {size:.3g} across"
+        )
     return PriorMeshes(
         np.asarray(frames, dtype=np.int64), np.asarray(vertices, dtype=np.float32), mesh.triangles
     )

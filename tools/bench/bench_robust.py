@@ -28,7 +28,6 @@ from capture.arrays import Image
 from capture.camera import CameraArray
 from capture.errors import LikenessError
 from recon.scan import reconstruct_images
-from recon.scan_warnings import missing_warnings
 from recon.surface import write_ply
 from tools.bench.bench_stereo import Instant, load_instant
 
@@ -43,13 +42,11 @@ class Fault:
         words: what it is.
         apply: the instant with the fault in it.
         devices: those at fault; every one of the array for a fault that all share.
-        gone: those whose image is missing.
     """
 
     words: str
     apply: Callable[[Instant], Instant]
     devices: tuple[str, ...] = ()
-    gone: tuple[str, ...] = ()
 
 
 def faults(names: Sequence[str]) -> list[Fault]:
@@ -64,7 +61,7 @@ def faults(names: Sequence[str]) -> list[Fault]:
     }
     cases = [Fault("none", lambda instant: instant)]
     for words, gone in choices.items():
-        cases.append(Fault(f"{_GONE} removed {words}", _without(gone), tuple(gone), tuple(gone)))
+        cases.append(Fault(f"{_GONE} removed {words}", _without(gone), tuple(gone)))
     one, three = names[middle - 2], (names[1], names[middle + 2], names[-2])
     cases.append(Fault("one out of focus", lambda instant: blurred(instant, one), (one,)))
     cases.append(Fault("highlights clipped", clipped, every))
@@ -153,7 +150,7 @@ def _row(fault: Fault, instant: Instant, arguments: argparse.Namespace) -> dict[
         result = reconstruct_images(bad.cameras, bad.images)
     except LikenessError as error:  # a refusal names the fault too
         return {**row, "refused": str(error)}
-    warnings = [*missing_warnings(fault.gone), *result.report.get("warnings", [])]
+    warnings = result.report["warnings"]
     row |= verdict(fault, warnings, instant.cameras.names)
     row["warnings"] = warnings
     row["agreement_p95_mm"] = result.report["agreement_p95_mm"]

@@ -1,12 +1,14 @@
 """Each fault of a device is named, by its number and in words; a good array is left in peace."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
 from capture.camera import CameraArray
+from capture.camera_file import read_cameras
 from recon.fusion import Points, fuse
 from recon.scan import ReconSettings
 from recon.scan_quality import CameraQuality, camera_qualities
@@ -14,6 +16,7 @@ from recon.scan_warnings import camera_warnings, missing_warnings, scan_warnings
 from recon.stereo import PairDepth, match_views
 from tests.synthetic_stereo import draw, ring
 
+SHARED = Path(__file__).resolve().parents[2].parent / "shared"
 ARRAY = ring((-18.0, 0.0, 18.0), (-9.0, 9.0))
 SETTINGS = ReconSettings(depth_mm=90.0, extent_mm=110.0)
 BAD = "cam04"
@@ -109,6 +112,37 @@ def test_a_device_that_sees_something_else_is_named(images):
     faulty = {**images, BAD: noise.astype(np.uint16)}
     found = judged(ARRAY, faulty)
     assert any("nothing matched" in w or "look at its image" in w for w in told(found)[BAD])
+
+
+@pytest.mark.slow
+@pytest.mark.shared_data
+def test_four_faults_on_a_face_are_told_apart():
+    source = SHARED / "takes" / "dev-smile"
+    cameras = read_cameras(source / "cameras.json")
+    images = {
+        c.name: cv2.imread(str(source / c.name / "0000.png"), cv2.IMREAD_GRAYSCALE) for c in cameras
+    }
+    blurred, dark, clipped, moved = (cameras.names[k] for k in (1, 5, 9, 13))
+    images[blurred] = cv2.GaussianBlur(images[blurred], (0, 0), 1.6)
+    images[dark] = np.rint(0.7 * images[dark]).astype(np.uint8)
+    bright = images[clipped] > 0.3 * images[clipped].max()
+    level = np.percentile(images[clipped][bright], 85)
+    images[clipped] = np.minimum(images[clipped], level).astype(np.uint8)
+    shifted = CameraArray(
+        tuple(replace(c, cx=c.cx + 0.3, cy=c.cy - 0.2) if c.name == moved else c for c in cameras)
+    )
+    settings = ReconSettings()
+    pairs = match_views(shifted, images, settings.stereo(), workers=2)
+    points = fuse([p.view for p in pairs if p.view], settings.fusion(), workers=2)
+    found = camera_warnings(camera_qualities(shifted, images, pairs, points))
+    assert set(found) == {blurred, dark, clipped, moved}
+    for name, word in (
+        (blurred, "out of focus"),
+        (dark, "darker"),
+        (clipped, "at white"),
+        (moved, "moved since the calibration"),
+    ):
+        assert any(word in sentence for sentence in found[name])
 
 
 GOOD = CameraQuality(

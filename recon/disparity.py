@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
 
 import cv2
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from capture.arrays import Bools, Floats32, check_shape
 from capture.errors import SettingsError
 from recon.images import noise_sigma
-from recon.refine import Refined, Refiner, grow
+from recon.refine import Refined, Refiner, grow, spline_rows, warp_rows
 
 _GROW_NCC = 0.4  # correlation from which a refined pixel lends its disparity to its neighbours
 
@@ -70,7 +72,7 @@ class DisparitySettings:
 
     seed_px: int = 480
     seed_block: int = 5
-    radius: int = 3
+    radius: int = 2
     iterations: int = 5
     smoothness: float = 20.0
     ncc_min: float = 0.5
@@ -80,7 +82,7 @@ class DisparitySettings:
     growth_px: int = 3
     left_right_px: float = 1.0
     fragment_px: int = 200
-    edge_px: int = 2
+    edge_px: int = 1
 
     def __post_init__(self) -> None:
         for name, low, high in _RANGES:
@@ -156,8 +158,42 @@ def seed_disparity(
     return np.ascontiguousarray(found, dtype=np.float32)
 
 
+def seed_near(
+    left: Floats32, right: Floats32, expected: Floats32, reach_px: float, block: int
+) -> Floats32:
+    """Disparity by semi-global matching near an expected one, instead of over a whole range.
+
+    The right view is drawn as the expectation predicts it, so that what is left to find is small
+    and windows follow the surface expected.
+
+    Args:
+        left: (H, W); NaN off the image.
+        right: (H, W); NaN off the image.
+        expected: (H, W) disparity expected; NaN where nothing is, and nothing will be found.
+        reach_px: how far from it the disparity may lie.
+        block: block size, odd.
+
+    Returns:
+        (H, W) float32 px; NaN where there is no unique, consistent match.
+    """
+    check_shape(left=(left, "H W"), right=(right, "H W"), expected=(expected, "H W"))
+    drawn = warp_rows(spline_rows(right), right, expected)
+    offset = seed_disparity(left, drawn, (-reach_px, reach_px), block)
+    # left(u) is like drawn(u - r), which is right(u - r - expected(u - r))
+    columns = np.arange(left.shape[1], dtype=np.float32)[None] - offset
+    known = np.isfinite(columns)
+    whole = np.clip(np.where(known, np.rint(columns), 0), 0, left.shape[1] - 1).astype(np.int64)
+    found: Floats32 = offset + np.take_along_axis(expected, whole, axis=1)
+    return found
+
+
 def match_pair(
-    left: Floats32, right: Floats32, limits_px: tuple[float, float], settings: DisparitySettings
+    left: Floats32,
+    right: Floats32,
+    limits_px: tuple[float, float],
+    settings: DisparitySettings,
+    *,
+    seeded: Callable[[Floats32, Floats32, int], Floats32] | None = None,
 ) -> DisparityMap:
     """Disparity of a rectified pair at full resolution.
 
@@ -166,15 +202,19 @@ def match_pair(
         right: (H, W) other view; NaN off the image.
         limits_px: range of disparities searched by the seed.
         settings: see there.
+        seeded: gives the seed (h, w) of the two views at so many halvings, where something better
+            is known than the range; None searches the range.
 
     Returns:
         Disparity, its confidence, and a reason for each pixel that has none.
     """
     levels = pyramid(left, right, settings.seed_px)
     factor = 2 ** (len(levels) - 1)
-    seed = seed_disparity(
-        *levels[-1], (limits_px[0] / factor, limits_px[1] / factor), settings.seed_block
-    )
+    if seeded is None:
+        limits = (limits_px[0] / factor, limits_px[1] / factor)
+        seed = seed_disparity(*levels[-1], limits, settings.seed_block)
+    else:
+        seed = seeded(*levels[-1], len(levels) - 1)
     refined = _climb(levels, seed, settings)
     mirrored = _right_view(refined, settings)
     return _judge(left, refined, mirrored, settings)
@@ -212,14 +252,24 @@ def _climb(
 
 def _right_view(refined: Refined, settings: DisparitySettings) -> Floats32:
     """The disparity seen by the right view: the nearest surface landing on each pixel."""
-    height, width = refined.disparity.shape
-    rows, columns = np.nonzero((refined.ncc > settings.ncc_min) & np.isfinite(refined.disparity))
-    values = refined.disparity[rows, columns]
-    target = np.rint(columns - values).astype(np.int64)
-    inside = (target >= 0) & (target < width)
-    nearest = np.full(height * width, -np.inf, np.float32)
-    np.maximum.at(nearest, rows[inside] * width + target[inside], values[inside])
-    return nearest.reshape(height, width)
+    good = refined.ncc > settings.ncc_min
+    return _nearest_landing(refined.disparity, good)  # type: ignore[no-any-return]
+
+
+@numba.njit(cache=True, nogil=True)
+def _nearest_landing(disparity: Floats32, good: Bools) -> Floats32:  # pragma: no cover - compiled
+    """The greatest disparity landing on each right pixel; -inf where none does."""
+    height, width = disparity.shape
+    out = np.full((height, width), np.float32(-np.inf))
+    for i in range(height):
+        for j in range(width):
+            d = disparity[i, j]
+            if not good[i, j] or np.isnan(d):
+                continue
+            target = int(np.rint(j - d))
+            if 0 <= target < width and d > out[i, target]:
+                out[i, target] = d
+    return out
 
 
 def _judge(

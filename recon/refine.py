@@ -148,16 +148,21 @@ def _grow_once(disparity: Floats32) -> Floats32:  # pragma: no cover - compiled
     """One pixel of growth: the plane through the known of a 7 x 7 window, or their mean."""
     height, width = disparity.shape
     out = disparity.copy()
-    for i in range(height):
+    count = np.zeros((3, width + 2), np.uint8)  # known of each 3 wide piece of three rows, a ring
+    for i in range(-1, height):
+        line = count[(i + 1) % 3]
+        line[:] = 0
+        if i + 1 < height:
+            for j in range(width):
+                if disparity[i + 1, j] == disparity[i + 1, j]:
+                    line[j] += 1
+                    line[j + 1] += 1
+                    line[j + 2] += 1
+        if i < 0:
+            continue
         for j in range(width):
-            if not np.isnan(disparity[i, j]):
-                continue
-            touching = 0
-            for di in range(-1, 2):
-                for dj in range(-1, 2):
-                    if 0 <= i + di < height and 0 <= j + dj < width:
-                        touching += not np.isnan(disparity[i + di, j + dj])
-            if touching >= 2:
+            touching = count[0, j + 1] + count[1, j + 1] + count[2, j + 1]
+            if touching >= 2 and np.isnan(disparity[i, j]):
                 out[i, j] = _extrapolated(disparity, i, j)
     return out
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
@@ -11,10 +11,18 @@ import numpy as np
 from capture.arrays import Floats, Floats32, Image
 from capture.camera import CameraArray
 from capture.errors import CameraError, SettingsError
-from recon.disparity import DisparityMap, DisparitySettings, Reason, halve, match_pair
+from recon.disparity import (
+    DisparityMap,
+    DisparitySettings,
+    Reason,
+    halve,
+    match_pair,
+    seed_near,
+)
 from recon.fusion import DepthView
 from recon.images import mono
 from recon.pairs import PairSettings, StereoPair, scene_centre, select_pairs
+from recon.prior import PriorMesh, prior_disparity
 from recon.rectify import (
     Rectification,
     coarser,
@@ -24,6 +32,7 @@ from recon.rectify import (
 )
 
 _SEARCH_PX = 240  # longest side of the crop in the wide search
+_PRIOR_GROWTH = 2  # rounds of growing from a prior, which covers what it knows
 _MARGIN = 0.06  # of the found disparities and of the crop, added on each side
 
 
@@ -93,6 +102,7 @@ def match_views(
     images: Mapping[str, Image],
     settings: StereoSettings,
     *,
+    prior: PriorMesh | None = None,
     workers: int = 1,
 ) -> list[PairDepth]:
     """Match every pair of an array at one instant.
@@ -101,6 +111,7 @@ def match_views(
         cameras: the cameras that have an image.
         images: by camera name, (H, W) or (H, W, 3), of any depth.
         settings: see there.
+        prior: where the surface is expected; only near it is looked, which is quicker.
         workers: threads; the result does not depend on it.
 
     Returns:
@@ -120,13 +131,22 @@ def match_views(
         def one(task: tuple[StereoPair, Rectification, int]) -> PairDepth:
             pair, geometry, level = task
             left, right = coefficients[pair.left], coefficients[pair.right]
-            found = _search(geometry, (left[level], right[level]), level, centre, settings)
+            if prior is None:
+                small = (left[level], right[level])
+                found = _search(geometry, small, level, centre, settings)
+            else:
+                found = _expected(geometry, level, centre, settings, prior)
             if found is None:
                 pixels = geometry.width * geometry.height
                 return PairDepth(pair, None, 0.0, {Reason.NO_SEED.name: pixels})
             crop, limits = found
             views = (rectified(crop, "left", left[0]), rectified(crop, "right", right[0]))
-            return _packaged(pair, crop, match_pair(*views, limits, settings.matching))
+            if prior is None:
+                result = match_pair(*views, limits, settings.matching)
+            else:
+                near = replace(settings.matching, growth=_PRIOR_GROWTH)
+                result = match_pair(*views, limits, near, seeded=_seeder(crop, prior, near))
+            return _packaged(pair, crop, result)
 
         return list(pool.map(one, zip(pairs, geometries, halvings, strict=True)))
 
@@ -205,6 +225,54 @@ def _search(
     rows, columns = np.nonzero(known & (coarse >= low) & (coarse <= high))
     found = np.stack([rows, columns, columns - coarse[rows, columns]]).astype(np.float64)
     return _window(geometry, small, found, scale), (low * scale, high * scale)
+
+
+def _expected(
+    geometry: Rectification,
+    halvings: int,
+    centre: Floats,
+    settings: StereoSettings,
+    prior: PriorMesh,
+) -> tuple[Rectification, tuple[float, float]] | None:
+    """As `_search`, from where a prior mesh is seen."""
+    scale = 2.0**halvings
+    small = rectification(
+        coarser(geometry.left, halvings), coarser(geometry.right, halvings), centre,
+        settings.extent_mm,
+    )  # fmt: skip
+    coarse = prior_disparity(small, prior.vertices, prior.triangles)
+    known = np.isfinite(coarse)
+    if known.sum() < 30:
+        return None
+    low, high = float(coarse[known].min()), float(coarse[known].max())
+    low, high = low - _reach_px(small, low, prior), high + _reach_px(small, high, prior)
+    rows, columns = np.nonzero(known)
+    found = np.stack([rows, columns, columns - coarse[rows, columns]]).astype(np.float64)
+    return _window(geometry, small, found, scale), (low * scale, high * scale)
+
+
+def _seeder(
+    crop: Rectification, prior: PriorMesh, settings: DisparitySettings
+) -> Callable[[Floats32, Floats32, int], Floats32]:
+    """Seeds of a pair from a prior mesh."""
+
+    def seed(left: Floats32, right: Floats32, level: int) -> Floats32:
+        expected = prior_disparity(crop, prior.vertices, prior.triangles, level)
+        known = expected[np.isfinite(expected)]
+        if len(known) == 0:
+            return expected
+        scale = 2.0**level
+        reach = _reach_px(crop, float(known.max()) * scale, prior) / scale
+        return seed_near(left, right, expected, max(reach, 1.0), settings.seed_block)
+
+    return seed
+
+
+def _reach_px(geometry: Rectification, disparity: float, prior: PriorMesh) -> float:
+    """How far the disparity may lie from one that a prior mesh gives."""
+    depth = float(geometry.depth(np.array(disparity)))
+    near = float(geometry.disparity(np.array(max(depth - prior.reach_mm, 0.5 * depth))))
+    return near - disparity
 
 
 def _window(

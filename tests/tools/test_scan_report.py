@@ -49,6 +49,7 @@ def told(frame: int, **more: object) -> dict[str, object]:
         "matched_share": 0.43,
         "points": 1000 + frame,
         "seconds": {"match": 3.0, "mesh": 1.0},
+        "rejected": {"seen_through": 12, "unconfirmed": 40},
         "cameras_report": [CAMERA],
         "warnings": [],
         **more,
@@ -104,6 +105,7 @@ def test_a_page_shows_every_frame_and_needs_nothing_else(take: Take, tmp_path: P
     assert {"depth of left", "depth of right"} <= set(page.pictures)
     assert "left and right: 43 % at 17.2 degrees" in text
     assert "newly made" in text
+    assert "seen through" in text
     assert "out of &lt;focus&gt;" in text
     assert "<focus>" not in text
     assert "agree to 0.05 mm" in text

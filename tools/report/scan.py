@@ -214,6 +214,7 @@ def _section(entry: _Frame, cameras: CameraArray) -> Section:
     if pairs and reasons:
         caption = "What became of the pixels of each device's pairs; the number is what matched."
         parts.append(figure(reason_bars(names, pairs, reasons), caption))
+    parts.append(_rejected(told))
     thumbs = depth_thumbnails(surface, cameras)
     if thumbs:
         parts.append(f"<h3>Depth in each view</h3>{thumbs}")
@@ -238,6 +239,18 @@ def _cameras_table(told: Mapping[str, Any]) -> str:
         for row in rows
     ]
     return table([*_COLUMNS.values(), "remarks"], cells)
+
+
+def _rejected(told: Mapping[str, Any]) -> str:
+    """Why points of single pairs are not in the scan; empty when nothing was said of it."""
+    rejected = told.get("rejected")
+    if not isinstance(rejected, Mapping) or not rejected:
+        return ""
+    names = [str(name).replace("_", " ") for name in rejected]
+    values = [_number(value) for value in rejected.values()]
+    labels = Labels(title="points not taken into the scan", x="points of single pairs")
+    chart = bar_chart(names, values, labels)
+    return figure(chart, "Points of single pairs that were not taken into the scan, by reason.")
 
 
 def _seconds(told: Mapping[str, Any]) -> str:

@@ -394,11 +394,10 @@ def _matched(
     workers = settings.workers or os.cpu_count() or 1
     there = CameraArray(tuple(camera for camera in cameras if camera.name in images))
     seconds: dict[str, float] = {}
-    near: dict[str, Any] = {} if prior is None else {"prior": prior}
     pairs = _timed(
         seconds,
         "match",
-        lambda: match_views(there, images, settings.stereo(), workers=workers, **near),
+        lambda: match_views(there, images, settings.stereo(), prior=prior, workers=workers),
     )
     views = [pair.view for pair in pairs if pair.view is not None]
     if not views:

@@ -16,10 +16,12 @@ from capture.camera_file import write_cameras
 from capture.errors import CameraError, SettingsError, SolveError, TakeError
 from recon.depth_maps import depth_map, read_depth_maps
 from recon.point_file import read_points
+from recon.prior import PriorMeshes
 from recon.scan import ReconSettings, load_scan, reconstruct, reconstruct_images
 from recon.surface import SurfaceQuery
 from recon.visiting import import_take
-from tests.synthetic_stereo import distance, draw, hit, ring
+from tests.recon.test_prior import sphere
+from tests.synthetic_stereo import RADII_MM, distance, draw, hit, ring
 
 SHARED = Path(__file__).resolve().parents[2].parent / "shared"
 ARRAY = ring((-18.0, 0.0, 18.0), (-9.0, 9.0))
@@ -240,6 +242,50 @@ def test_depth_maps_are_added_to_finished_scans(tmp_path, images):
     scan = load_scan(path)
     again = depth_map(ARRAY[0], scan.vertices, scan.triangles)
     np.testing.assert_array_equal(again, maps[ARRAY[0].name])
+
+
+def _prior(*frames: int, aside_mm: float = 2.0) -> PriorMeshes:
+    """The ellipsoid, a little too large, as if tracked at some frames."""
+    vertices, triangles = sphere(40, RADII_MM + aside_mm)
+    return PriorMeshes(
+        np.array(frames, dtype=np.int64),
+        np.stack([vertices + 0.01 * f for f in frames]).astype(np.float32),
+        triangles,
+    )
+
+
+def test_a_prior_leads_to_the_same_surface(images, result):
+    found = reconstruct_images(ARRAY, images, SMALL, prior=_prior(0).at(0, 6.0))
+    error = np.abs(distance(found.scan.vertices.astype(np.float64)))
+    assert np.median(error) < 0.15  # mm, not the 2 mm of the prior
+    assert np.percentile(error, 95) < 0.6
+    assert len(found.points) > 0.9 * len(result.points)
+
+
+def test_a_frame_is_remade_when_its_own_prior_changes(tmp_path, few):
+    take = import_take(_visit(tmp_path, few, few), tmp_path / "take")
+    folder = take.products / "recon"
+
+    def stamps() -> list[int]:
+        return [(folder / f"frame_{f:04d}.ply").stat().st_mtime_ns for f in (0, 1)]
+
+    def inputs(frame: int) -> dict[str, str]:
+        path = folder / f"frame_{frame:04d}.ply.record.json"
+        told: dict[str, str] = json.loads(path.read_text(encoding="utf-8"))["inputs"]
+        return told
+
+    settings = replace(SMALL, prior_mm=6.0)
+    reconstruct(take, [0, 1], settings, prior=_prior(1))
+    assert set(inputs(0)) == {"take"}  # it has no mesh before the first tracked frame
+    assert set(inputs(1)) == {"take", "prior"}
+    first = stamps()
+    reconstruct(take, [0, 1], settings, prior=_prior(1))
+    assert stamps() == first
+    reconstruct(take, [0], settings)  # as without a prior
+    assert stamps() == first
+    reconstruct(take, [0, 1], settings, prior=_prior(1, aside_mm=1.0))
+    assert stamps()[0] == first[0]
+    assert stamps()[1] != first[1]
 
 
 @pytest.mark.slow

@@ -81,9 +81,9 @@ class ReconSettings:
     ncc_min: float = 0.5
     agree_px: float = 0.7
     agreeing: int = 2
-    voxel_px: float = 1.2
-    cell_spacings: float = 2.2
-    evidence_spacings: float = 2.5
+    voxel_px: float = 1.6
+    cell_spacings: float = 1.85
+    evidence_spacings: float = 3.0
     prior_mm: float = 8.0
     mesh: bool = True
     depth_maps: bool = False

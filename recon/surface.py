@@ -18,6 +18,8 @@ from capture.errors import SettingsError, SolveError, TakeError
 from capture.product import replacing
 from recon.fusion import Points
 
+_MARGIN = 1.1  # Poisson's cube over the extent of the points
+
 
 @dataclass(frozen=True, eq=False)
 class Scan:
@@ -42,22 +44,26 @@ class SurfaceSettings:
 
     Attributes:
         cell_spacings: side of the finest Poisson cell, in point spacings.
-        depth_max: deepest octree allowed, whatever the spacing asks for.
+        depth_max: no cell is smaller than the extent of the points over two to this power.
         evidence_spacings: vertices farther than this from every point are cut away: holes stay
             holes.
+        lone_spacings: the same where the nearest point is known to one pair alone: its rim may
+            hang over.
         component_share: pieces with a smaller share of the largest one's triangles are dropped.
         threads: of the Poisson solver.
     """
 
-    cell_spacings: float = 2.2
-    depth_max: int = 8
-    evidence_spacings: float = 2.5
+    cell_spacings: float = 1.85
+    depth_max: int = 9
+    evidence_spacings: float = 3.0
+    lone_spacings: float = 1.2
     component_share: float = 0.01
     threads: int = 1
 
     def __post_init__(self) -> None:
         for name, low, high in (
             ("cell_spacings", 0.5, 20.0), ("depth_max", 5, 12), ("evidence_spacings", 1.0, 50.0),
+            ("lone_spacings", 0.0, 50.0),
             ("component_share", 0.0, 1.0), ("threads", 1, 256),
         ):  # fmt: skip
             value = getattr(self, name)
@@ -80,12 +86,12 @@ def poisson_scan(points: Points, settings: SurfaceSettings) -> Scan:
         raise SolveError(f"a surface needs at least 100 points, found {len(points)}")
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points.positions.astype(np.float64)))
     cloud.normals = o3d.utility.Vector3dVector(points.normals.astype(np.float64))
-    extent = float(np.ptp(points.positions, axis=0).max()) * 1.1
-    depth = int(np.ceil(np.log2(extent / (settings.cell_spacings * points.spacing_mm))))
-    depth = min(max(depth, 5), settings.depth_max)
+    cell = settings.cell_spacings * points.spacing_mm
+    extent = float(np.ptp(points.positions, axis=0).max()) * _MARGIN
+    cell = max(cell, extent / 2**settings.depth_max)
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         mesh, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(
-            cloud, depth=depth, scale=1.1, linear_fit=False, n_threads=settings.threads
+            cloud, width=cell, scale=_MARGIN, linear_fit=False, n_threads=settings.threads
         )
     vertices = np.asarray(mesh.vertices)
     triangles = np.asarray(mesh.triangles).astype(np.int32)
@@ -98,7 +104,8 @@ def _trim(points: Points, vertices: Floats, triangles: Ints32, settings: Surface
     tree = cKDTree(points.positions)
     answer = tree.query(vertices, distance_upper_bound=reach)
     distance, nearest = np.asarray(answer[0]), np.asarray(answer[1])
-    near = np.isfinite(distance)
+    lone = np.append(points.support < 2, True)[nearest]
+    near = np.isfinite(distance) & ~(lone & (distance > settings.lone_spacings * points.spacing_mm))
     kept = triangles[near[triangles].all(axis=1)]
     kept = kept[_large_pieces(kept, len(vertices), settings.component_share)]
     if len(kept) == 0:

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from capture.errors import SettingsError
-from recon.fusion import DepthView, FusionSettings, _consensus, _pack, fuse, lift
+from recon.consensus import consensus
+from recon.fusion import DepthView, FusionSettings, _pack, fuse, lift
 from recon.rectify import rectification
 from tests.synthetic_stereo import RADII_MM, distance, hit, ring
 
@@ -76,7 +77,7 @@ def test_the_compiled_consensus_is_the_plain_weighted_mean():
     points, normals, sigma = lift(made[1], 7)
     good = np.isfinite(normals).all(axis=1)
     points, normals, sigma = points[good], normals[good], sigma[good]
-    moved, _, support, *_ = _consensus(points, normals, sigma, 1, _pack(made), 0.7)
+    moved, _, support, *_ = consensus(points, normals, sigma, 1, _pack(made), 0.7)
     for n in range(0, len(points), 40):
         total, weight, count = 0.0, 0.0, 0
         for index, view in enumerate(made):
@@ -89,7 +90,7 @@ def test_the_compiled_consensus_is_the_plain_weighted_mean():
             offset = normals[n] @ (reached - points[n])
             depth = ray @ view.geometry.rotation[2]
             mm = (normals[n] @ ray) * depth / (view.geometry.focal_px * view.geometry.baseline_mm)
-            trust = 1 / (mm**2 * (0.05**2 + 0.05**2))
+            trust = 1 / (mm**2 * (0.05**2 + 0.15**2))
             total, weight, count = total + trust * offset, weight + trust, count + 1
         assert support[n] == count
         np.testing.assert_allclose(moved[n], points[n] + total / weight * normals[n], atol=1e-3)

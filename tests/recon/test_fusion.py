@@ -5,7 +5,7 @@ import pytest
 
 from capture.errors import SettingsError
 from recon.consensus import consensus
-from recon.fusion import DepthView, FusionSettings, _pack, fuse, lift
+from recon.fusion import REJECTIONS, DepthView, FusionSettings, _pack, fuse, lift
 from recon.rectify import rectification
 from tests.synthetic_stereo import RADII_MM, distance, hit, ring
 
@@ -110,3 +110,51 @@ def _bilinear(plane: np.ndarray, column: float, row: float) -> float:
 def test_a_setting_out_of_range_is_named():
     with pytest.raises(SettingsError, match="agree_px: expected"):
         FusionSettings(agree_px=-1.0)
+
+
+def test_every_lifted_point_is_fused_or_counted():
+    made = views(noise_px=0.3)
+    settings = FusionSettings(voxel_px=0.1)  # voxels so small that each holds one point
+    rejected = fuse(made, settings).rejected
+    lifted = [lift(view, settings.stride) for view in made]
+    kept = len(fuse(made, settings))
+    assert set(rejected) == set(REJECTIONS)
+    assert rejected["ragged"] == sum(np.isnan(n[:, 0]).sum() for _, n, _ in lifted)
+    missing = sum(len(points) for points, _, _ in lifted) - sum(rejected.values()) - kept
+    assert 0 <= missing < 0.02 * kept  # two points in one voxel
+
+
+def test_all_pixels_of_a_rim_are_taken_and_a_lattice_elsewhere():
+    whole = views()[0]
+    plane = whole.disparity.copy()
+    plane[:, 60:] = np.nan
+    sparse, dense = (
+        lift(DepthView(whole.geometry, plane, whole.sigma_px), stride) for stride in (4, 1)
+    )
+    reached = whole.geometry.project(sparse[0].astype(np.float64))
+    columns, rows = np.rint(reached[:, 0]).astype(int), np.rint(reached[:, 1]).astype(int)
+    known = np.isfinite(plane)
+    assert len(dense[0]) == known.sum()
+    taken = np.zeros_like(known)
+    taken[rows, columns] = True
+    assert taken[known[:, 59], 59].all()
+    inner = known.copy()
+    for shift in (-2, -1, 1, 2):
+        inner &= np.roll(known, shift, 0) & np.roll(known, shift, 1)
+    inner[:2], inner[-2:], inner[:, :2] = False, False, False
+    assert taken[inner].mean() < 0.35
+
+
+def test_a_point_of_one_pair_stays_until_another_sees_through_it_or_stands_before_it():
+    honest = views()
+    alone = fuse(honest[:1], FusionSettings())
+    assert len(alone) > 100
+    assert alone.support.max() == 1
+    behind = honest[0].disparity - 6.0  # farther than the surface all other pairs see
+    hidden = [DepthView(honest[0].geometry, behind, honest[0].sigma_px), *honest[1:]]
+    wrong = [
+        (np.abs(distance(fuse(hidden, settings).positions.astype(np.float64))) > 2.0).sum()
+        for settings in (FusionSettings(lone_hidden=100), FusionSettings(lone_hidden=0))
+    ]
+    assert wrong[0] > 200
+    assert wrong[1] < 0.2 * wrong[0]

@@ -1,5 +1,7 @@
 """Meshes through points, closest points, rays, and scans on disk."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -99,3 +101,11 @@ def test_what_is_no_mesh_is_refused_by_name(tmp_path):
         read_ply(tmp_path / "bad.ply")
     with pytest.raises(TakeError, match="no such scan"):
         read_ply(tmp_path / "none.ply")
+
+
+def test_the_surface_reaches_less_far_from_points_of_one_pair():
+    points = sphere(cap=True)
+    lone = dataclasses.replace(points, support=np.ones(len(points), np.int32))
+    far, near = (poisson_scan(given, SurfaceSettings()) for given in (points, lone))
+    assert near.vertices[:, 2].max() < far.vertices[:, 2].max() - 1.0
+    assert near.vertices[:, 2].max() < 0.7 * 20.0 + 1.2

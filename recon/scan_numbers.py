@@ -55,6 +55,7 @@ def scan_numbers(
         "matched_share": _plain(share),
         "unconfirmed_share": _plain(float(np.mean(strays))) if strays else None,
         "points": len(points),
+        "rejected": dict(points.rejected),
         "spacing_mm": _plain(points.spacing_mm),
         "footprint_mm": _plain(footprint_mm),
         "agreement_median_mm": _plain(points.agreement_mm[0]),

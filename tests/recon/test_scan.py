@@ -74,6 +74,7 @@ def test_the_numbers_say_how_it_went(result):
     assert [row["name"] for row in report["cameras_report"]] == report["cameras"]
     assert len(report["pair_reasons"]) == len(report["pairs"])
     assert report["warnings"] == []
+    assert report["rejected"] == dict(result.points.rejected)
     assert all(9 <= pair["angle_deg"] <= 27 for pair in report["pairs"])
     json.dumps(report)
 

@@ -8,9 +8,9 @@ import numpy as np
 
 from recon.scan_quality import CameraQuality
 
-# Thresholds. On good takes pairs agree to 0.3 to 0.45 footprints (95 %), to 1.1 with every image off
-# by 0.3 px. On rendered takes without faults deviations stay below 0.03 px, sharpness within 0.9
-# to 1.1, gain within 0.92 to 1.06; a blur of 1.2 px gives 0.74, an image shifted by 0.3 px 0.27.
+# Thresholds. On good takes pairs agree to 0.3 to 0.45 footprints (95 %), to 1.1 with every image
+# off by 0.3 px. On rendered takes without faults deviations stay below 0.03 px, sharpness within
+# 0.9 to 1.1, gain within 0.92 to 1.06; a blur of 1.2 px gives 0.74, a shift of 0.3 px 0.27.
 _DEVIATION_PX = 0.08
 _ABOVE_OTHERS = 2.0  # a deviation is one camera's own when it is this many times the others'
 _SHARPNESS = 0.82

@@ -52,7 +52,7 @@ class FusionSettings:
     lone_facing: float = 0.2
     lone_sigma_px: float = 0.2
     lone_hidden: int = 2
-    stride: int = 4
+    stride: int = 6
     voxel_px: float = 1.6
     passes: int = 1
 

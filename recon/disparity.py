@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntEnum
 
 import cv2
@@ -16,6 +16,7 @@ from capture.errors import SettingsError
 from recon.images import noise_sigma
 from recon.refine import Refined, Refiner, grow, spline_rows, warp_rows
 
+_SIGMA_WANTED_PX = 0.12  # typical deviation that windows are widened for
 _GROW_NCC = 0.4  # correlation from which a refined pixel lends its disparity to its neighbours
 
 
@@ -47,7 +48,36 @@ _RANGES = (
     ("left_right_px", 0.01, 100.0),
     ("fragment_px", 0, 10**7),
     ("edge_px", 0, 50),
+    ("jump_px", 0.0, 1e3),
 )
+
+
+@dataclass(frozen=True, kw_only=True)
+class SeedShape:
+    """What the seed takes the scene for; the defaults are skin: smooth, nowhere unique.
+
+    Attributes:
+        step_cost: of a disparity that changes by one between neighbours, OpenCV's P1 / block^2.
+        jump_cost: of one that changes by more, P2 / block^2.
+        uniqueness: by how many percent the best match must beat the second best.
+        flat_px: deviation of the window in which views are normalised.
+        flat_floor: least contrast that is normalised in full, of the white.
+    """
+
+    step_cost: int = 8
+    jump_cost: int = 32
+    uniqueness: int = 5
+    flat_px: float = 6.0
+    flat_floor: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name, low, high in (
+            ("step_cost", 1, 1000), ("jump_cost", 1, 1000), ("uniqueness", 0, 100),
+            ("flat_px", 1.0, 100.0), ("flat_floor", 0.0, 1.0),
+        ):  # fmt: skip
+            value = getattr(self, name)
+            if not low <= value <= high:
+                raise SettingsError(f"{name}: expected {low}..{high}, found {value}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,7 +87,7 @@ class DisparitySettings:
     Attributes:
         seed_px: the seed is matched at the first halving at which the crop is at most this long.
         seed_block: block size of semi-global matching, odd, px.
-        radius: of the refinement window at full resolution, px.
+        radius: of the refinement window, px; up to twice that where skin shows little.
         iterations: refinement steps of the last round at each level; earlier rounds take half.
         smoothness: weight of the smooth surface against a match known to 0.1 px.
         ncc_min: least correlation of the windows.
@@ -68,11 +98,14 @@ class DisparitySettings:
         left_right_px: largest disagreement with the right view's own disparity.
         fragment_px: patches smaller than this many pixels are dropped.
         edge_px: width of the border of the matched area that is dropped.
+        seed: what the seed takes the scene for.
+        jump_px: where the seed changes by more within a window there is a step between surfaces:
+            a seed made at full resolution is kept there as it is; 0 looks for none.
     """
 
     seed_px: int = 480
     seed_block: int = 5
-    radius: int = 2
+    radius: int = 3
     iterations: int = 5
     smoothness: float = 20.0
     ncc_min: float = 0.5
@@ -82,7 +115,9 @@ class DisparitySettings:
     growth_px: int = 3
     left_right_px: float = 1.0
     fragment_px: int = 200
-    edge_px: int = 1
+    edge_px: int = 2
+    seed: SeedShape = field(default_factory=SeedShape)
+    jump_px: float = 0.0
 
     def __post_init__(self) -> None:
         for name, low, high in _RANGES:
@@ -116,7 +151,11 @@ class DisparityMap:
 
 
 def seed_disparity(
-    left: Floats32, right: Floats32, limits_px: tuple[float, float], block: int
+    left: Floats32,
+    right: Floats32,
+    limits_px: tuple[float, float],
+    block: int,
+    shape: SeedShape | None = None,
 ) -> Floats32:
     """Disparity by semi-global matching over a given range, left-right checked, unique.
 
@@ -125,6 +164,7 @@ def seed_disparity(
         right: (H, W); NaN off the image.
         limits_px: least and greatest disparity.
         block: block size, odd.
+        shape: what the scene is like; None is skin.
 
     Returns:
         (H, W) float32 px; NaN where there is no unique, consistent match.
@@ -134,22 +174,25 @@ def seed_disparity(
         OpenCV's StereoSGBM, MODE_HH (eight paths), on locally normalised 8-bit views.
     """
     check_shape(left=(left, "H W"), right=(right, "H W"))
+    shape = shape or SeedShape()
     low = int(np.floor(limits_px[0])) - 1
     count = int(np.ceil((limits_px[1] + 1 - low) / 16.0)) * 16
     pad_left, pad_right = max(low + count, 0), max(-low, 0)
     views = [
-        cv2.copyMakeBorder(_flat_8bit(v), 0, 0, pad_left, pad_right, cv2.BORDER_CONSTANT, value=128)
+        cv2.copyMakeBorder(
+            _flat_8bit(v, shape), 0, 0, pad_left, pad_right, cv2.BORDER_CONSTANT, value=128
+        )
         for v in (left, right)
     ]
     matcher = cv2.StereoSGBM.create(
         minDisparity=low,
         numDisparities=count,
         blockSize=block,
-        P1=8 * block * block,
-        P2=32 * block * block,
+        P1=shape.step_cost * block * block,
+        P2=shape.jump_cost * block * block,
         disp12MaxDiff=1,
         preFilterCap=63,
-        uniquenessRatio=5,
+        uniquenessRatio=shape.uniqueness,
         mode=cv2.STEREO_SGBM_MODE_HH,
     )
     raw = matcher.compute(views[0], views[1])[:, pad_left : pad_left + left.shape[1]]
@@ -212,10 +255,12 @@ def match_pair(
     factor = 2 ** (len(levels) - 1)
     if seeded is None:
         limits = (limits_px[0] / factor, limits_px[1] / factor)
-        seed = seed_disparity(*levels[-1], limits, settings.seed_block)
+        seed = seed_disparity(*levels[-1], limits, settings.seed_block, settings.seed)
     else:
         seed = seeded(*levels[-1], len(levels) - 1)
     refined = _climb(levels, seed, settings)
+    if settings.jump_px > 0 and len(levels) == 1:
+        refined = _stepped(seed, refined, settings)
     mirrored = _right_view(refined, settings)
     return _judge(left, refined, mirrored, settings)
 
@@ -236,18 +281,44 @@ def _climb(
     refined = Refined(seed, np.full_like(seed, np.nan), np.full_like(seed, np.nan))
     for index in range(len(levels) - 1, -1, -1):
         refiner = Refiner(*levels[index])
+        radius = settings.radius
         rounds = settings.growth if index == len(levels) - 1 else settings.growth - 1
         for turn in range(max(rounds, 1)):
             refined = refiner.refine(
                 grow(start, settings.growth_px),
-                radius=settings.radius,
+                radius=radius,
                 iterations=settings.iterations if turn == rounds - 1 else settings.iterations // 2,
                 smoothness=settings.smoothness,
             )
+            radius = _fitting_radius(refined, settings)
             start = np.where(refined.ncc > _GROW_NCC, refined.disparity, np.float32(np.nan))
         if index > 0:
             start = _double(start, levels[index - 1][0].shape)
     return refined
+
+
+def _fitting_radius(refined: Refined, settings: DisparitySettings) -> int:
+    """The window's radius for as much certainty as can be had: wider on skin that shows little."""
+    found = refined.sigma_px[refined.ncc > _GROW_NCC]
+    if len(found) == 0:
+        return settings.radius
+    wider = settings.radius * float(np.nanmedian(found)) / _SIGMA_WANTED_PX
+    return int(np.clip(round(wider), settings.radius, 2 * settings.radius))
+
+
+def _stepped(seed: Floats32, refined: Refined, settings: DisparitySettings) -> Refined:
+    """The refined map where the seed is smooth and they agree, the seed itself elsewhere."""
+    size = 2 * settings.radius + 3
+    lowest = np.where(np.isfinite(seed), seed, np.float32(-1e6))
+    window = np.ones((size, size), np.uint8)
+    smooth = cv2.dilate(lowest, window) - cv2.erode(lowest, window) < settings.jump_px
+    smooth &= np.abs(refined.disparity - seed) < 1.0
+    smooth &= (refined.ncc > settings.ncc_min) & (refined.sigma_px < settings.sigma_max_px)
+    return Refined(
+        np.where(smooth, refined.disparity, seed),
+        np.where(smooth, refined.ncc, np.float32(settings.ncc_min)),
+        np.where(smooth, refined.sigma_px, np.float32(settings.sigma_max_px)),
+    )
 
 
 def _right_view(refined: Refined, settings: DisparitySettings) -> Floats32:
@@ -316,15 +387,15 @@ def _fragments(disparity: Floats32, size_px: int) -> Bools:
     return gone
 
 
-def _flat_8bit(image: Floats32) -> NDArray[np.uint8]:
+def _flat_8bit(image: Floats32, shape: SeedShape) -> NDArray[np.uint8]:
     """Locally normalised 8-bit view: mean 128, a local deviation is 42 grey levels; NaN is 128."""
     known = np.isfinite(image)
     filled = np.where(known, image, np.float32(0.0))
-    share = cv2.GaussianBlur(known.astype(np.float32), (0, 0), 6.0) + np.float32(1e-6)
-    mean = cv2.GaussianBlur(filled, (0, 0), 6.0) / share
+    share = cv2.GaussianBlur(known.astype(np.float32), (0, 0), shape.flat_px) + np.float32(1e-6)
+    mean = cv2.GaussianBlur(filled, (0, 0), shape.flat_px) / share
     centred = np.where(known, image - mean, np.float32(0.0))
-    spread = np.sqrt(cv2.GaussianBlur(centred * centred, (0, 0), 6.0) / share)
-    floor = 3.0 * max(noise_sigma(filled), 1e-4)
+    spread = np.sqrt(cv2.GaussianBlur(centred * centred, (0, 0), shape.flat_px) / share)
+    floor = max(3.0 * max(noise_sigma(filled), 1e-4), shape.flat_floor)
     flat = 128.0 + 42.0 * centred / np.sqrt(spread * spread + np.float32(floor * floor))
     return np.clip(np.rint(flat), 0, 255).astype(np.uint8)
 

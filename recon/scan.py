@@ -26,6 +26,7 @@ from capture.product import hash_file, is_current, replacing, stage_record, writ
 from capture.progress import Progress, silent
 from capture.settings import check_range
 from capture.take import Take
+from recon.aim import aimed, estimate_aims
 from recon.depth_maps import write_depth_maps
 from recon.disparity import DisparitySettings
 from recon.fusion import FusionSettings, Points, fuse
@@ -33,7 +34,8 @@ from recon.mesh_process import Meshed, Mesher
 from recon.pairs import PairSettings
 from recon.point_file import is_points_file, points_scan
 from recon.prior import PriorMesh, PriorMeshes
-from recon.scan_numbers import scan_numbers
+from recon.scan_numbers import aim_numbers, scan_numbers
+from recon.scan_warnings import aim_warnings
 from recon.stereo import StereoSettings, match_views
 from recon.surface import Scan, SurfaceSettings, poisson_scan, read_ply, write_ply
 
@@ -52,7 +54,7 @@ class ReconSettings:
         angle_min_deg: least angle between the two views of a pair.
         angle_max_deg: greatest angle between the two views of a pair.
         partners: pairs a camera asks for.
-        radius_px: of the matching window at full resolution.
+        radius_px: of the matching window; up to twice that where skin shows little.
         iterations: of refinement at each resolution.
         smoothness: weight of the smooth surface against a match known to 0.1 px.
         ncc_min: least correlation of matched windows.
@@ -62,6 +64,8 @@ class ReconSettings:
         cell_spacings: finest Poisson cell, in point spacings.
         evidence_spacings: surface farther than this from every point is cut away.
         prior_mm: with a prior mesh, how far from it the surface is looked for.
+        correct_aims: find by how much the images have moved since calibration, from how pairs
+            disagree, tell it, and scan as if they had not (`recon.aim`).
         mesh: make a mesh; without, the oriented points are the product.
         depth_maps: also write the depth map of the mesh in each camera.
         workers: threads; 0 takes one a processor. The result does not depend on it.
@@ -85,6 +89,7 @@ class ReconSettings:
     cell_spacings: float = 1.85
     evidence_spacings: float = 3.0
     prior_mm: float = 8.0
+    correct_aims: bool = True
     mesh: bool = True
     depth_maps: bool = False
     workers: int = 0
@@ -399,7 +404,9 @@ def _matched(
         "match",
         lambda: match_views(there, images, settings.stereo(), prior=prior, workers=workers),
     )
-    views = [pair.view for pair in pairs if pair.view is not None]
+    aims = estimate_aims(there, pairs) if settings.correct_aims else None
+    true = [aimed(pair, aims) for pair in pairs] if aims and aims.certain else pairs
+    views = [pair.view for pair in true if pair.view is not None]
     if not views:
         raise SolveError(f"nothing found: none of {len(pairs)} pairs of views match anywhere")
     points = _timed(seconds, "fuse", lambda: fuse(views, settings.fusion(), workers=workers))
@@ -413,6 +420,9 @@ def _matched(
         "quality",
         lambda: scan_numbers(cameras, images, pairs, points, points.spacing_mm / settings.voxel_px),
     )
+    if aims is not None:
+        numbers["aims"] = aim_numbers(there.names, aims)
+        numbers["warnings"] = numbers["warnings"] + aim_warnings(there.names, aims)
     return points, {**numbers, "seconds": seconds}
 
 

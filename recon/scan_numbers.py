@@ -11,11 +11,30 @@ import numpy as np
 
 from capture.arrays import Image
 from capture.camera import CameraArray
+from recon.aim import Aims
 from recon.disparity import Reason
 from recon.fusion import Points
 from recon.scan_quality import CameraQuality, camera_qualities
 from recon.scan_warnings import camera_warnings, missing_warnings, scan_warnings
 from recon.stereo import PairDepth
+
+
+def aim_numbers(names: Sequence[str], aims: Aims) -> dict[str, Any]:
+    """By how much the images have moved on their sensors since calibration, fit for JSON."""
+    return {
+        "samples": aims.samples,
+        "corrected": aims.certain,
+        "deviation_before": _plain(aims.agreement[0]),
+        "deviation_after": _plain(aims.agreement[1]),
+        "cameras": {
+            name: {
+                "columns_px": _plain(float(shift[0])),
+                "rows_px": _plain(float(shift[1])),
+                "sigma_px": _plain(float(max(sigma))),
+            }
+            for name, shift, sigma in zip(names, aims.shift_px, aims.shift_sigma_px, strict=True)
+        },
+    }
 
 
 def scan_numbers(

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from recon.aim import Aims
 from recon.scan_quality import CameraQuality
 
 # Thresholds. On good takes pairs agree to 0.3 to 0.45 footprints (95 %), to 1.1 with every image
@@ -18,6 +19,8 @@ _CLIPPED = 0.03  # share of the skin
 _GAIN = 0.2  # of darker or brighter
 _SHARE = 0.6  # matched, of what the neighbours match
 _MATCHED = 0.15  # of all textured pixels: below it the whole scan is in doubt
+_MOVED_PX = 0.12  # an image that lies this far from its calibrated place is told
+_MOVED_SIGMAS = 3.0
 _AGREEMENT_PX = 0.7  # 95th percentile of the deviation between pairs, in pixel footprints
 
 
@@ -64,6 +67,26 @@ def scan_warnings(
     for name, sentences in camera_warnings(qualities).items():
         out += [f"{name}: {sentence}" for sentence in sentences]
     return out
+
+
+def aim_warnings(names: Sequence[str], aims: Aims) -> list[str]:
+    """Which images have moved on their sensors since calibration; one sentence when most have."""
+    if not aims.certain:
+        return []
+    length = np.hypot(*aims.shift_px.T)
+    moved = length > np.maximum(_MOVED_PX, _MOVED_SIGMAS * np.hypot(*aims.shift_sigma_px.T))
+    if moved.sum() > len(names) / 2:
+        columns, rows = np.median(aims.shift_px[moved], axis=0)
+        return [
+            f"all cameras: the images lie {np.median(length[moved]):.2f} px (median; columns "
+            f"{columns:+.2f}, rows {rows:+.2f}) from where the calibration puts them; this scan is "
+            "corrected for it: calibrate again"
+        ]
+    return [
+        f"{names[k]}: its image lies {length[k]:.2f} px from where the calibration puts it; this "
+        "scan is corrected for it: calibrate again"
+        for k in np.flatnonzero(moved).tolist()
+    ]
 
 
 def missing_warnings(missing: Sequence[str]) -> list[str]:

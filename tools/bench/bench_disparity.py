@@ -31,7 +31,7 @@ from capture.archive import read_archive
 from capture.arrays import Bools, Floats, Floats32, Ints32
 from capture.camera_file import read_cameras
 from capture.errors import TakeError
-from recon.disparity import DisparitySettings, match_pair
+from recon.disparity import DisparitySettings, SeedShape, match_pair
 from recon.images import mono
 from recon.pairs import StereoPair, scene_centre, select_pairs
 from recon.png import decode_png
@@ -45,8 +45,9 @@ _MARGIN = 0.06
 _BLOCK = 5
 # A scene of steps and colours, not skin: nothing is cut off at edges, small patches stay
 STEPPED = DisparitySettings(
-    seed_px=512, radius=2, smoothness=5.0, ncc_min=0.2, contrast_min=0.0, sigma_max_px=1.0,
-    left_right_px=2.0, fragment_px=40, edge_px=0,
+    seed_px=512, seed_block=1, jump_px=2, contrast_min=0.0, left_right_px=100.0,
+    fragment_px=40, edge_px=0,
+    seed=SeedShape(jump_cost=16, uniqueness=20, flat_px=25.0, flat_floor=0.08),
 )  # fmt: skip
 
 

@@ -86,7 +86,7 @@ class ReconSettings:
     agree_px: float = 0.7
     agreeing: int = 2
     voxel_px: float = 1.6
-    cell_spacings: float = 1.85
+    cell_spacings: float = 2.2
     evidence_spacings: float = 3.0
     prior_mm: float = 8.0
     correct_aims: bool = True

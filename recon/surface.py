@@ -53,7 +53,7 @@ class SurfaceSettings:
         threads: of the Poisson solver.
     """
 
-    cell_spacings: float = 1.85
+    cell_spacings: float = 2.2
     depth_max: int = 9
     evidence_spacings: float = 3.0
     lone_spacings: float = 1.2

@@ -22,7 +22,7 @@ from recon.fusion import DepthView, lift
 from recon.rectify import Rectification
 from recon.stereo import PairDepth
 
-_SAMPLES = 5000  # points, over all pairs
+_SAMPLES = 8000  # points, over all pairs
 _EXPECTED_PX = 0.3  # deviation of an aim before anything is known
 _ALIKE_PX = 50.0  # so many neighbouring pixels err alike, their windows being much the same
 _CERTAIN_PX = 0.035  # aims less certain than this are not believed

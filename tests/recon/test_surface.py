@@ -40,7 +40,7 @@ def square() -> tuple[np.ndarray, np.ndarray]:
 def test_poisson_recovers_a_sphere_with_outward_normals():
     scan = poisson_scan(sphere(), SurfaceSettings())
     radius = np.linalg.norm(scan.vertices, axis=1)
-    assert np.abs(radius - 20.0).max() < 0.05  # mm
+    assert np.abs(radius - 20.0).max() < 0.06  # mm
     cosine = (scan.normals * scan.vertices).sum(axis=1) / radius
     assert cosine.min() > 0.98
     np.testing.assert_allclose(scan.confidence, 0.8)

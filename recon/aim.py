@@ -25,7 +25,7 @@ from recon.stereo import PairDepth
 _SAMPLES = 8000  # points, over all pairs
 _EXPECTED_PX = 0.3  # deviation of an aim before anything is known
 _ALIKE_PX = 50.0  # so many neighbouring pixels err alike, their windows being much the same
-_CERTAIN_PX = 0.035  # aims less certain than this are not believed
+_CERTAIN_PX = 0.04  # aims less certain than this are not believed
 _AGREE_PX = 1.0  # pairs farther apart see different surfaces
 _FACING = 0.4  # least cosine between normal and view
 _FLOOR_PX = 0.05  # no match is trusted beyond this

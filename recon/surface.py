@@ -110,11 +110,21 @@ def _trim(points: Points, vertices: Floats, triangles: Ints32, settings: Surface
     kept = kept[_large_pieces(kept, len(vertices), settings.component_share)]
     if len(kept) == 0:
         raise SolveError("no surface is left where the points give evidence")
+    kept = _welded(vertices.astype(np.float32), kept)
     used, compact = np.unique(kept, return_inverse=True)
     out = vertices[used].astype(np.float32)
     faces = compact.reshape(-1, 3).astype(np.int32)
     confidence = points.confidence[np.minimum(nearest[used], len(points) - 1)]
     return Scan(out, faces, _normals(out, faces), confidence.astype(np.float32))
+
+
+def _welded(vertices: Floats32, triangles: Ints32) -> Ints32:
+    """Triangles with vertices that fall together made one; those that vanish by it are dropped."""
+    _, first, group = np.unique(vertices, axis=0, return_index=True, return_inverse=True)
+    joined = first[group.reshape(-1)].astype(np.int32)[triangles]
+    a, b, c = joined.T
+    whole: Ints32 = joined[(a != b) & (b != c) & (c != a)]
+    return whole
 
 
 def _large_pieces(triangles: Ints32, vertex_count: int, share: float) -> Bools:

@@ -163,7 +163,7 @@ def _closest_around(
 
 @numba.njit(cache=True)
 def _on_triangle(d1: float, d2: float, bb: float, bc: float, cc: float) -> tuple[float, float]:
-    """Weights of b and c at the point of triangle abc closest to p.
+    """Weights of b and c at the point of triangle abc closest to p; abc may be a line or a point.
 
     Args:
         d1: (b - a) . (p - a), and d2 (c - a) . (p - a).
@@ -184,13 +184,14 @@ def _on_triangle(d1: float, d2: float, bb: float, bc: float, cc: float) -> tuple
         return 0.0, 1.0
     vc = d1 * d4 - d3 * d2
     if vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
-        return d1 / (d1 - d3), 0.0
+        return d1 / (d1 - d3) if d1 > d3 else 0.0, 0.0
     vb = d5 * d2 - d1 * d6
     if vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
-        return 0.0, d2 / (d2 - d6)
+        return 0.0, d2 / (d2 - d6) if d2 > d6 else 0.0
     va = d3 * d6 - d5 * d4
     if va <= 0.0 and d4 - d3 >= 0.0 and d5 - d6 >= 0.0:
-        w = (d4 - d3) / ((d4 - d3) + (d5 - d6))
+        span = (d4 - d3) + (d5 - d6)
+        w = (d4 - d3) / span if span > 0.0 else 0.0
         return 1.0 - w, w
     total = va + vb + vc
     if total <= 0.0:

@@ -109,3 +109,11 @@ def test_the_surface_reaches_less_far_from_points_of_one_pair():
     far, near = (poisson_scan(given, SurfaceSettings()) for given in (points, lone))
     assert near.vertices[:, 2].max() < far.vertices[:, 2].max() - 1.0
     assert near.vertices[:, 2].max() < 0.7 * 20.0 + 1.2
+
+
+def test_a_scan_has_no_triangle_without_area():
+    scan = poisson_scan(sphere(), SurfaceSettings())
+    corners = scan.vertices.astype(np.float64)[scan.triangles]
+    sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
+    assert sides.min() > 0.0
+    assert len(np.unique(scan.vertices, axis=0)) == len(scan.vertices)

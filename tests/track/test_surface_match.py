@@ -24,6 +24,20 @@ def test_near_the_surface_matches_are_the_closest_points() -> None:
     assert found.barycentric.min() >= -1e-12
 
 
+def test_triangles_without_area_are_met_at_their_nearest_place() -> None:
+    """A line and a point beside a true triangle, in every order of their corners."""
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.5, 0, 0], [1, 0, 0]], dtype=np.float64)
+    asked = np.array([[0.5, -0.2, 0.3], [1.4, -0.3, 0.1], [-0.3, -0.3, 0.2], [0.2, 0.9, 0.0]])
+    for line in ([0, 1, 4], [1, 4, 0], [4, 0, 1], [0, 3, 1], [1, 0, 3], [1, 4, 1]):
+        triangles = np.array([[0, 1, 2], line], dtype=np.int32)
+        surface = MatchSurface(vertices, triangles, normal_mm=0.001)
+        found = surface.match(asked, np.tile([0.0, 0.0, 1.0], (4, 1)))
+        _, _, distance = closest_points(vertices, triangles[:1], asked)
+        assert np.isfinite(found.points).all()
+        assert (found.distance_mm >= distance - 1e-6).all()
+        assert found.distance_mm[:3] == pytest.approx(distance[:3], abs=0.35)
+
+
 def test_normals_tell_two_sheets_apart() -> None:
     """Two sheets 1 mm apart that face away from each other: the further one looks our way."""
     x, y = np.meshgrid(np.arange(10.0), np.arange(10.0))

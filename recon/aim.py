@@ -29,6 +29,7 @@ _CERTAIN_PX = 0.04  # aims less certain than this are not believed
 _AGREE_PX = 1.0  # pairs farther apart see different surfaces
 _FACING = 0.4  # least cosine between normal and view
 _FLOOR_PX = 0.05  # no match is trusted beyond this
+_MOVED_PX = 0.2  # faces before cameras that stand still show up to 0.15
 _ROUNDS = 4  # of reweighting
 _NUDGE = 1e-6  # rad
 
@@ -57,6 +58,18 @@ class Aims:
     def certain(self) -> bool:
         """Whether the pairs tell all aims well enough to correct anything by them."""
         return self.samples > 0 and float(self.shift_sigma_px.max()) <= _CERTAIN_PX
+
+    @property
+    def moved(self) -> Bools:
+        """(C,) cameras whose image has moved by more than light and slant make believe."""
+        length = np.hypot(*self.shift_px.T)
+        beyond: Bools = length > np.maximum(_MOVED_PX, 3.0 * np.hypot(*self.shift_sigma_px.T))
+        return beyond & self.certain
+
+    @property
+    def correct(self) -> bool:
+        """Whether a scan should be corrected by these aims: one image at least has moved."""
+        return bool(self.moved.any())
 
     @property
     def shift_px(self) -> Floats:

@@ -405,7 +405,7 @@ def _matched(
         lambda: match_views(there, images, settings.stereo(), prior=prior, workers=workers),
     )
     aims = estimate_aims(there, pairs) if settings.correct_aims else None
-    true = [aimed(pair, aims) for pair in pairs] if aims and aims.certain else pairs
+    true = [aimed(pair, aims) for pair in pairs] if aims and aims.correct else pairs
     views = [pair.view for pair in true if pair.view is not None]
     if not views:
         raise SolveError(f"nothing found: none of {len(pairs)} pairs of views match anywhere")

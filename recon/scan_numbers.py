@@ -23,7 +23,7 @@ def aim_numbers(names: Sequence[str], aims: Aims) -> dict[str, Any]:
     """By how much the images have moved on their sensors since calibration, fit for JSON."""
     return {
         "samples": aims.samples,
-        "corrected": aims.certain,
+        "corrected": aims.correct,
         "deviation_before": _plain(aims.agreement[0]),
         "deviation_after": _plain(aims.agreement[1]),
         "cameras": {

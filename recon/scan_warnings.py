@@ -19,8 +19,6 @@ _CLIPPED = 0.03  # share of the skin
 _GAIN = 0.2  # of darker or brighter
 _SHARE = 0.6  # matched, of what the neighbours match
 _MATCHED = 0.15  # of all textured pixels: below it the whole scan is in doubt
-_MOVED_PX = 0.12  # an image that lies this far from its calibrated place is told
-_MOVED_SIGMAS = 3.0
 _AGREEMENT_PX = 0.7  # 95th percentile of the deviation between pairs, in pixel footprints
 
 
@@ -71,10 +69,7 @@ def scan_warnings(
 
 def aim_warnings(names: Sequence[str], aims: Aims) -> list[str]:
     """Which images have moved on their sensors since calibration; one sentence when most have."""
-    if not aims.certain:
-        return []
-    length = np.hypot(*aims.shift_px.T)
-    moved = length > np.maximum(_MOVED_PX, _MOVED_SIGMAS * np.hypot(*aims.shift_sigma_px.T))
+    length, moved = np.hypot(*aims.shift_px.T), aims.moved
     if moved.sum() > len(names) / 2:
         columns, rows = np.median(aims.shift_px[moved], axis=0)
         return [

@@ -9,6 +9,7 @@ from recon.aim import Aims, aimed, estimate_aims
 from recon.fusion import DepthView
 from recon.pairs import StereoPair, select_pairs
 from recon.rectify import Rectification, rectification
+from recon.scan_warnings import aim_warnings
 from recon.stereo import PairDepth
 from tests.synthetic_stereo import RADII_MM, ring
 
@@ -119,4 +120,21 @@ def test_one_pair_tells_nothing_of_aims() -> None:
     nothing = estimate_aims(ARRAY, [PairDepth(pair, None, 0.0, {})])
     assert nothing.samples == 0
     assert not nothing.certain
+    assert not nothing.correct
+
+
+def test_only_certain_shifts_beyond_what_light_feigns_are_corrected() -> None:
+    focal = np.full(3, 1000.0)
+    sure, unsure = np.full((3, 3), 2e-5), np.full((3, 3), 1e-4)
+    small, large = np.full((3, 3), 1e-4), np.zeros((3, 3))
+    large[1, 0] = 3e-4
+    assert not Aims(small, sure, focal, (1.0, 1.0), 9).correct
+    assert not Aims(large, unsure, focal, (1.0, 1.0), 9).correct
+    aims = Aims(large, sure, focal, (1.0, 1.0), 9)
+    assert aims.moved.tolist() == [False, True, False]
+    told = aim_warnings(["a", "b", "c"], aims)
+    assert len(told) == 1
+    assert told[0].startswith("b: its image lies 0.30 px")
+    everyone = Aims(np.full((3, 3), 3e-4), sure, focal, (1.0, 1.0), 9)
+    assert aim_warnings(["a", "b", "c"], everyone)[0].startswith("all cameras: the images lie")
     assert (nothing.turns == 0).all()

@@ -121,6 +121,7 @@ def test_one_pair_tells_nothing_of_aims() -> None:
     assert nothing.samples == 0
     assert not nothing.certain
     assert not nothing.correct
+    assert (nothing.turns == 0).all()
 
 
 def test_only_certain_shifts_beyond_what_light_feigns_are_corrected() -> None:
@@ -137,4 +138,3 @@ def test_only_certain_shifts_beyond_what_light_feigns_are_corrected() -> None:
     assert told[0].startswith("b: its image lies 0.30 px")
     everyone = Aims(np.full((3, 3), 3e-4), sure, focal, (1.0, 1.0), 9)
     assert aim_warnings(["a", "b", "c"], everyone)[0].startswith("all cameras: the images lie")
-    assert (nothing.turns == 0).all()

@@ -16,9 +16,10 @@ import numba
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from capture.arrays import Bools, Floats, Floats32, Ints, check_shape
+from capture.arrays import Bools, Floats, Floats32, Ints
 from capture.camera import Camera, CameraArray
 from recon.fusion import DepthView, lift
+from recon.images import bilinear
 from recon.rectify import Rectification
 from recon.stereo import PairDepth
 
@@ -214,14 +215,17 @@ def _seen(pair: PairDepth, view: DepthView, points: Floats, normals: Floats) -> 
     place = geometry.project(points)
     towards = geometry.left.centre - points
     facing = (normals * towards).sum(axis=1) > _FACING * np.linalg.norm(towards, axis=1)
-    disparity, sigma_px, known = _looked_up(view, place)
-    index = np.flatnonzero(facing & known & (np.abs(disparity - place[:, 2]) < _AGREE_PX))
+    disparity = bilinear(view.disparity, place[:, 0], place[:, 1])
+    near = facing & (np.abs(disparity - place[:, 2]) < _AGREE_PX)  # NaN fails
+    index = np.flatnonzero(near)
+    column, row = np.rint(place[index, :2]).astype(np.int64).T
+    sigma_px = view.sigma_px[row, column].astype(np.float64)
     match = np.stack([place[index, 0], place[index, 1], disparity[index]], axis=1)
     at, normal = geometry.triangulate(match), normals[index]
     offset = ((at - points[index]) * normal).sum(axis=1)
     match[:, 2] += 0.01
     deeper = 100.0 * ((geometry.triangulate(match) - at) * normal).sum(axis=1)
-    sigma = np.hypot(sigma_px[index], _FLOOR_PX) * np.maximum(np.abs(deeper), 1e-9)
+    sigma = np.hypot(sigma_px, _FLOOR_PX) * np.maximum(np.abs(deeper), 1e-9)
     first = [3 * pair.pair.left, 3 * pair.pair.right]
     columns = [start + axis for start in first for axis in range(3)]
     alike = max(_ALIKE_PX * len(index) / max(int(np.isfinite(view.disparity).sum()), 1), 1.0)
@@ -253,23 +257,6 @@ def _met(geometry: Rectification, left: Floats, right: Floats) -> Floats:
     depth = geometry.baseline_mm / slant / first[:, 2]
     points: Floats = geometry.left.centre + depth[:, None] * left
     return points
-
-
-def _looked_up(view: DepthView, place: Floats) -> tuple[Floats, Floats, Bools]:
-    """Bilinear disparity (N,), nearest deviation (N,), and where there is one."""
-    check_shape(place=(place, "N 3"))
-    height, width = view.disparity.shape
-    inside = (place[:, 0] >= 0) & (place[:, 1] >= 0)
-    inside &= (place[:, 0] < width - 1) & (place[:, 1] < height - 1)
-    column, row = np.where(inside, place[:, 0], 0.0), np.where(inside, place[:, 1], 0.0)
-    i, j = row.astype(np.int64), column.astype(np.int64)
-    t, s = column - j, row - i
-    d = view.disparity.astype(np.float64)
-    value: Floats = (1 - s) * ((1 - t) * d[i, j] + t * d[i, j + 1])
-    value = value + s * ((1 - t) * d[i + 1, j] + t * d[i + 1, j + 1])
-    sigma = view.sigma_px[np.rint(row).astype(np.int64), np.rint(column).astype(np.int64)]
-    known: Bools = inside & np.isfinite(value) & np.isfinite(sigma)
-    return value, sigma.astype(np.float64), known
 
 
 def _normal_equations(

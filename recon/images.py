@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-import numpy as np
+from typing import Any
 
-from capture.arrays import Floats32, Image
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from capture.arrays import Floats, Floats32, Image
 from capture.errors import ShapeError
 
 # Equal weights for the two outer channels: RGB and BGR give the same grey.
@@ -59,3 +63,14 @@ def noise_sigma(image: Floats32) -> float:
     wide = image[:, :-2] - 2.0 * image[:, 1:-1] + image[:, 2:]
     response = wide[:-2] - 2.0 * wide[1:-1] + wide[2:]
     return float(np.median(np.abs(response)) / (0.6745 * 6.0))
+
+
+def bilinear(plane: NDArray[Any], column: Floats, row: Floats) -> Floats:
+    """Bilinear values (N,) of a plane (H, W); NaN outside, or where a neighbour is NaN."""
+    inside = (
+        (column >= 0) & (row >= 0) & (column <= plane.shape[1] - 1) & (row <= plane.shape[0] - 1)
+    )
+    out = np.full(len(column), np.nan)
+    at = np.stack([row[inside], column[inside]])
+    out[inside] = ndimage.map_coordinates(plane, at, order=1, output=np.float64, prefilter=False)
+    return out

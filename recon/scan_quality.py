@@ -8,19 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
-from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from capture.arrays import Bools, Floats, Floats32, Image
 from capture.camera import Camera, CameraArray
 from recon.disparity import Reason
 from recon.fusion import Points
-from recon.images import mono
+from recon.images import bilinear, mono
 from recon.row_offset import row_offset
 from recon.stereo import PairDepth
 
@@ -152,7 +149,7 @@ def _shared(pair: PairDepth, world: Floats, planes: Sequence[Floats32]) -> _Shar
     front = np.where(local[:, 2:] > 1.0, local, np.nan)
     column = front[:, 0] / front[:, 2] * geometry.focal_px + geometry.left_column
     row = front[:, 1] / front[:, 2] * geometry.focal_px + geometry.row
-    found = _looked_up(pair.view.disparity, column, row)
+    found = bilinear(pair.view.disparity, column, row)
     offset = found - geometry.disparity(front[:, 2])
     same = np.abs(offset) < _SAME_PX
     if same.sum() < _LEAST:
@@ -194,9 +191,9 @@ def _look(camera: Camera, image: Image, world: Floats, seen: Bools) -> _View:
     at = (pixels[:, 0] - low[0], pixels[:, 1] - low[1])
     clipped, covered = _skin_shares(part, pixels[known] - low)
     return _View(
-        level=_looked_up(blurred[1], *at),
-        fine=_looked_up(blurred[0] - blurred[1], *at),
-        coarse=_looked_up(blurred[1] - blurred[2], *at),
+        level=bilinear(blurred[1], *at),
+        fine=bilinear(blurred[0] - blurred[1], *at),
+        coarse=bilinear(blurred[1] - blurred[2], *at),
         clipped=clipped,
         covered=covered,
     )
@@ -314,15 +311,4 @@ def _unconfirmed(pairs: Sequence[PairDepth], points: Points) -> list[float]:
         world = pair.view.geometry.triangulate(np.stack([columns, rows, values], axis=1))
         away = np.asarray(tree.query(world, distance_upper_bound=reach)[0])
         out.append(float(np.isinf(away).mean()))
-    return out
-
-
-def _looked_up(plane: NDArray[Any], column: Floats, row: Floats) -> Floats:
-    """Bilinear values (N,) of a plane (H, W); NaN outside, or where a neighbour is NaN."""
-    inside = (
-        (column >= 0) & (row >= 0) & (column <= plane.shape[1] - 1) & (row <= plane.shape[0] - 1)
-    )
-    out = np.full(len(column), np.nan)
-    at = np.stack([row[inside], column[inside]])
-    out[inside] = ndimage.map_coordinates(plane, at, order=1, output=np.float64, prefilter=False)
     return out

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Set
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -32,6 +33,7 @@ from recon.rectify import (
 )
 
 _SEARCH_PX = 240  # longest side of the crop in the wide search
+_LEAST_FOUND = 30  # pixels at low resolution, fewer of which are no face
 _PRIOR_GROWTH = 2  # rounds of growing from a prior, which covers what it knows
 _MARGIN = 0.06  # of the found disparities and of the crop, added on each side
 
@@ -79,6 +81,14 @@ class PairDepth:
     reasons: Mapping[str, int]
 
 
+class _Found(NamedTuple):
+    """What a pair shows at low resolution: disparity (H, W), NaN unknown, and its range, px."""
+
+    coarse: Floats32
+    low: float
+    high: float
+
+
 def stereo_pairs(
     cameras: CameraArray, settings: StereoSettings
 ) -> tuple[Floats, tuple[StereoPair, ...]]:
@@ -123,23 +133,28 @@ def match_views(
     centre, pairs = stereo_pairs(cameras, settings)
     geometries = [_geometry(cameras, pair, centre, settings) for pair in pairs]
     halvings = [_search_halvings(geometry) for geometry in geometries]
-    used = sorted({index for pair in pairs for index in (pair.left, pair.right)})
+    used: dict[int, set[int]] = {}
+    for pair, level in zip(pairs, halvings, strict=True):
+        for index in (pair.left, pair.right):
+            used.setdefault(index, {0}).update({level} if prior is None else ())
     with ThreadPoolExecutor(max_workers=max(workers, 1)) as pool:
-        planes = pool.map(lambda index: _planes(cameras, images, index, max(halvings)), used)
+        planes = pool.map(lambda index: _planes(cameras, images, index, used[index]), used)
         coefficients = dict(zip(used, planes, strict=True))
 
         def one(task: tuple[StereoPair, Rectification, int]) -> PairDepth:
             pair, geometry, level = task
             left, right = coefficients[pair.left], coefficients[pair.right]
+            halved = coarser(geometry.left, level), coarser(geometry.right, level)
+            small = rectification(*halved, centre, settings.extent_mm)
             if prior is None:
-                small = (left[level], right[level])
-                found = _search(geometry, small, level, centre, settings)
+                found = _search(small, (left[level], right[level]), centre, settings)
             else:
-                found = _expected(geometry, level, centre, settings, prior)
+                found = _expected(small, prior)
             if found is None:
                 pixels = geometry.width * geometry.height
                 return PairDepth(pair, None, 0.0, {Reason.NO_SEED.name: pixels})
-            crop, limits = found
+            crop = _window(geometry, small, found.coarse)
+            limits = (found.low * 2.0**level, found.high * 2.0**level)
             views = (rectified(crop, "left", left[0]), rectified(crop, "right", right[0]))
             if prior is None:
                 result = match_pair(*views, limits, settings.matching)
@@ -164,9 +179,9 @@ def _search_halvings(geometry: Rectification) -> int:
 
 
 def _planes(
-    cameras: CameraArray, images: Mapping[str, Image], index: int, halvings: int
-) -> list[Floats32]:
-    """Spline coefficients of an image and of its halvings."""
+    cameras: CameraArray, images: Mapping[str, Image], index: int, wanted: Set[int]
+) -> dict[int, Floats32]:
+    """Spline coefficients of an image, by how often it was halved before."""
     camera = cameras[index]
     grey = mono(images[camera.name])
     if grey.shape != (camera.height, camera.width):
@@ -174,10 +189,12 @@ def _planes(
             f"{camera.name}: the camera is {camera.width} x {camera.height} px, "
             f"its image {grey.shape[1]} x {grey.shape[0]}"
         )
-    levels = [grey]
-    for _ in range(halvings):
-        levels.append(halve(levels[-1]))
-    return [spline_coefficients(level) for level in levels]
+    out = {}
+    for level in range(max(wanted) + 1):
+        grey = halve(grey) if level else grey
+        if level in wanted:
+            out[level] = spline_coefficients(grey)
+    return out
 
 
 def _packaged(pair: StereoPair, crop: Rectification, result: DisparityMap) -> PairDepth:
@@ -191,24 +208,13 @@ def _packaged(pair: StereoPair, crop: Rectification, result: DisparityMap) -> Pa
 
 
 def _search(
-    geometry: Rectification,
+    small: Rectification,
     coefficients: tuple[Floats32, Floats32],
-    halvings: int,
     centre: Floats,
     settings: StereoSettings,
-) -> tuple[Rectification, tuple[float, float]] | None:
-    """Look through the whole depth range at low resolution.
-
-    Returns:
-        The geometry cropped to what was found in both views, and the least and greatest disparity
-        there; None where too little was found.
-    """
-    scale = 2.0**halvings
-    small = rectification(
-        coarser(geometry.left, halvings), coarser(geometry.right, halvings), centre,
-        settings.extent_mm,
-    )  # fmt: skip
-    depth = float(geometry.rotation[2] @ (centre - geometry.left.centre))
+) -> _Found | None:
+    """Look through the whole depth range at low resolution; None where too little is found."""
+    depth = float(small.rotation[2] @ (centre - small.left.centre))
     reach = min(settings.depth_mm, 0.8 * depth)
     far, near = small.disparity(np.array([depth + reach, depth - reach])).tolist()
     matching = replace(
@@ -217,38 +223,23 @@ def _search(
     views = (rectified(small, "left", coefficients[0]), rectified(small, "right", coefficients[1]))
     coarse = match_pair(*views, (far, near), matching).disparity
     known = np.isfinite(coarse)
-    if known.sum() < 30:
+    if known.sum() < _LEAST_FOUND:
         return None
     low, high = np.percentile(coarse[known], [0.2, 99.8]).tolist()
     margin = _MARGIN * (near - far)
     low, high = max(low - margin, far), min(high + margin, near)
-    rows, columns = np.nonzero(known & (coarse >= low) & (coarse <= high))
-    found = np.stack([rows, columns, columns - coarse[rows, columns]]).astype(np.float64)
-    return _window(geometry, small, found, scale), (low * scale, high * scale)
+    coarse[~(known & (coarse >= low) & (coarse <= high))] = np.nan
+    return _Found(coarse, low, high)
 
 
-def _expected(
-    geometry: Rectification,
-    halvings: int,
-    centre: Floats,
-    settings: StereoSettings,
-    prior: PriorMesh,
-) -> tuple[Rectification, tuple[float, float]] | None:
+def _expected(small: Rectification, prior: PriorMesh) -> _Found | None:
     """As `_search`, from where a prior mesh is seen."""
-    scale = 2.0**halvings
-    small = rectification(
-        coarser(geometry.left, halvings), coarser(geometry.right, halvings), centre,
-        settings.extent_mm,
-    )  # fmt: skip
     coarse = prior_disparity(small, prior.vertices, prior.triangles)
-    known = np.isfinite(coarse)
-    if known.sum() < 30:
+    known = coarse[np.isfinite(coarse)]
+    if len(known) < _LEAST_FOUND:
         return None
-    low, high = float(coarse[known].min()), float(coarse[known].max())
-    low, high = low - _reach_px(small, low, prior), high + _reach_px(small, high, prior)
-    rows, columns = np.nonzero(known)
-    found = np.stack([rows, columns, columns - coarse[rows, columns]]).astype(np.float64)
-    return _window(geometry, small, found, scale), (low * scale, high * scale)
+    low, high = float(known.min()), float(known.max())
+    return _Found(coarse, low - _reach_px(small, low, prior), high + _reach_px(small, high, prior))
 
 
 def _seeder(
@@ -275,14 +266,11 @@ def _reach_px(geometry: Rectification, disparity: float, prior: PriorMesh) -> fl
     return near - disparity
 
 
-def _window(
-    geometry: Rectification,
-    small: Rectification,
-    found: Floats,
-    scale: float,
-) -> Rectification:
+def _window(geometry: Rectification, small: Rectification, coarse: Floats32) -> Rectification:
     """The geometry cropped to what was found at a lower resolution, in both views."""
-    rows, columns, landed = found
+    scale = geometry.focal_px / small.focal_px
+    rows, columns = np.nonzero(np.isfinite(coarse))
+    landed = columns - coarse[rows, columns].astype(np.float64)
     pad = np.ceil(_MARGIN * max(small.width, small.height))
     left = scale * (columns - small.left_column) + geometry.left_column
     right = scale * (landed - small.right_column) + geometry.right_column

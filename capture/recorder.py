@@ -13,7 +13,7 @@ from capture.errors import SettingsError
 from capture.frame import FrameEvent
 from capture.frame_header import FrameHeader
 from capture.ledger import Ledger
-from capture.settings import check_range
+from capture.settings import check_ranges
 
 Sink = Callable[[str, FrameHeader, Image], None]
 
@@ -41,12 +41,10 @@ class RecordSettings:
     keep_incomplete: bool = False
 
     def __post_init__(self) -> None:
-        check_range("record.rate_hz", self.rate_hz, 1, 1000)
-        check_range("record.exposure_us", self.exposure_us, 1, 1e6)
-        check_range("record.pre_roll", self.pre_roll, 0, 1000)
-        check_range("record.post_roll", self.post_roll, 0, 1000)
-        check_range("record.retention_ms", self.retention_ms, 1, 10_000)
-        check_range("record.latches", self.latches, 1, 1000)
+        check_ranges(
+            "record", self, rate_hz=(1, 1000), exposure_us=(1, 1e6), pre_roll=(0, 1000),
+            post_roll=(0, 1000), retention_ms=(1, 10_000), latches=(1, 1000),
+        )  # fmt: skip
         if self.exposure_us >= 1e6 / self.rate_hz:
             raise SettingsError(
                 f"record.exposure_us must be below the period of {1e6 / self.rate_hz:.0f} us, "

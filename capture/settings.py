@@ -86,26 +86,25 @@ def settings_to_toml(stages: Mapping[str, Any]) -> str:
     return "\n\n".join(blocks) + "\n"
 
 
-def check_range(
-    where: str, value: float, low: float, high: float = float("inf"), *, open_low: bool = False
-) -> None:
-    """Refuse a setting outside low..high; to be called from a settings dataclass.
+def check_ranges(stage: str, settings: Any, /, **ranges: tuple[float, float]) -> None:
+    """Refuse settings out of their ranges; to be called from a settings dataclass.
 
     Args:
-        where: stage and key, as `recon.voxel_mm`.
-        value: what was set.
-        low: the smallest good value, or with `open_low` the value it must exceed.
-        high: the largest good value.
-        open_low: whether `low` itself is refused.
+        stage: that they belong to, for the message.
+        settings: the dataclass.
+        ranges: by name of a field, the smallest and the largest good value; NaN never is good.
 
     Raises:
-        SettingsError: naming the setting, the value found and the range.
+        SettingsError: naming every such setting, the value found and the range.
     """
-    good = (value > low if open_low else value >= low) and value <= high
-    if not good:  # NaN fails both comparisons
-        left = "above" if open_low else "at least"
-        right = f" and at most {high:g}" if high != float("inf") else ""
-        raise SettingsError(f"{where} = {value!r}: must be {left} {low:g}{right}")
+    problems = []
+    for name, (low, high) in ranges.items():
+        value = getattr(settings, name)
+        if not low <= value <= high:
+            most = f" and at most {high:g}" if high != float("inf") else ""
+            problems.append(f"{stage}.{name} = {value!r}: must be at least {low:g}{most}")
+    if problems:
+        raise SettingsError("; ".join(problems))
 
 
 def _fitted(value: Any, hint: Any) -> Any:

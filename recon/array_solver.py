@@ -9,6 +9,7 @@ import numpy as np
 from capture.arrays import Bools, Floats, check_shape
 from capture.errors import SettingsError, SolveError, TakeError, raise_all
 from capture.progress import Progress, silent
+from capture.settings import check_ranges
 from recon.array_covariance import focal_sigma
 from recon.array_state import ArrayState
 from recon.array_world import IMAGE_UP, ArrayWorld, array_world
@@ -55,17 +56,13 @@ class CalibrateSettings:
     image_up: str = "top"
 
     def __post_init__(self) -> None:
-        ranges: dict[str, tuple[float, float]] = {
-            "min_corners": (4, 1000), "max_blur_px": (0.5, 100.0), "still_px": (0.0, 100.0),
-            "max_poses": (3, 10000),
-            "least_views": (2, 10000), "least_poses": (3, 10000), "loss_px": (0.01, 100.0),
-            "outlier_sigmas": (2.0, 100.0), "held_out": (0.0, 0.5),
-        }  # fmt: skip
-        problems = [
-            f"{key}: must lie in {low:g}..{high:g}, found {getattr(self, key)}"
-            for key, (low, high) in ranges.items()
-            if not low <= getattr(self, key) <= high
-        ]
+        check_ranges(
+            "calibrate", self, min_corners=(4, 1000), max_blur_px=(0.5, 100.0),
+            still_px=(0.0, 100.0), max_poses=(3, 10000), least_views=(2, 10000),
+            least_poses=(3, 10000), loss_px=(0.01, 100.0), outlier_sigmas=(2.0, 100.0),
+            held_out=(0.0, 0.5),
+        )  # fmt: skip
+        problems: list[str] = []
         if self.focal_guess is not None and not 0.2 <= self.focal_guess <= 50.0:
             problems.append(
                 "focal_guess: focal length over image width must lie in 0.2..50, "

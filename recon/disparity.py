@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from capture.arrays import Bools, Floats32, check_shape
 from capture.errors import SettingsError
+from capture.settings import check_ranges
 from recon.images import noise_sigma
 from recon.refine import Refined, Refiner, grow, spline_rows, warp_rows
 
@@ -34,22 +35,22 @@ class Reason(IntEnum):
     EDGE = 8  # on the border of the matched area, where windows reach beyond the surface
 
 
-_RANGES = (
-    ("seed_px", 64, 4096),
-    ("seed_block", 1, 21),
-    ("radius", 1, 20),
-    ("iterations", 1, 200),
-    ("smoothness", 0.0, 1e3),
-    ("ncc_min", 0.0, 0.99),
-    ("contrast_min", 0.0, 100.0),
-    ("sigma_max_px", 1e-3, 10.0),
-    ("growth", 1, 20),
-    ("growth_px", 0, 50),
-    ("left_right_px", 0.01, 100.0),
-    ("fragment_px", 0, 10**7),
-    ("edge_px", 0, 50),
-    ("jump_px", 0.0, 1e3),
-)
+_RANGES: dict[str, tuple[float, float]] = {
+    "seed_px": (64, 4096),
+    "seed_block": (1, 21),
+    "radius": (1, 20),
+    "iterations": (1, 200),
+    "smoothness": (0.0, 1e3),
+    "ncc_min": (0.0, 0.99),
+    "contrast_min": (0.0, 100.0),
+    "sigma_max_px": (1e-3, 10.0),
+    "growth": (1, 20),
+    "growth_px": (0, 50),
+    "left_right_px": (0.01, 100.0),
+    "fragment_px": (0, 10**7),
+    "edge_px": (0, 50),
+    "jump_px": (0.0, 1e3),
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,13 +72,10 @@ class SeedShape:
     flat_floor: float = 0.0
 
     def __post_init__(self) -> None:
-        for name, low, high in (
-            ("step_cost", 1, 1000), ("jump_cost", 1, 1000), ("uniqueness", 0, 100),
-            ("flat_px", 1.0, 100.0), ("flat_floor", 0.0, 1.0),
-        ):  # fmt: skip
-            value = getattr(self, name)
-            if not low <= value <= high:
-                raise SettingsError(f"{name}: expected {low}..{high}, found {value}")
+        check_ranges(
+            "seed", self, step_cost=(1, 1000), jump_cost=(1, 1000), uniqueness=(0, 100),
+            flat_px=(1.0, 100.0), flat_floor=(0.0, 1.0),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,10 +118,7 @@ class DisparitySettings:
     jump_px: float = 0.0
 
     def __post_init__(self) -> None:
-        for name, low, high in _RANGES:
-            value = getattr(self, name)
-            if not low <= value <= high:
-                raise SettingsError(f"{name}: expected {low}..{high}, found {value}")
+        check_ranges("matching", self, **_RANGES)
         if self.seed_block % 2 == 0:
             raise SettingsError(f"seed_block: expected an odd number, found {self.seed_block}")
 

@@ -10,22 +10,22 @@ from typing import NamedTuple
 import numpy as np
 
 from capture.arrays import Bools, Floats, Floats32, Ints, Ints32, check_shape
-from capture.errors import SettingsError
+from capture.settings import check_ranges
 from recon.consensus import PackedViews, consensus, lift_pixels, rim
 from recon.rectify import Rectification
 
 REJECTIONS = ("ragged", "oblique", "seen_through", "unconfirmed", "mixed")
-_RANGES = (
-    ("agree_px", 0.01, 20.0),
-    ("agreeing", 0, 20),
-    ("facing_min", 0.0, 0.95),
-    ("lone_facing", 0.0, 1.0),
-    ("lone_sigma_px", 0.0, 10.0),
-    ("lone_hidden", 0, 100),
-    ("stride", 1, 16),
-    ("voxel_px", 0.1, 50.0),
-    ("passes", 1, 5),
-)
+_RANGES: dict[str, tuple[float, float]] = {
+    "agree_px": (0.01, 20.0),
+    "agreeing": (0, 20),
+    "facing_min": (0.0, 0.95),
+    "lone_facing": (0.0, 1.0),
+    "lone_sigma_px": (0.0, 10.0),
+    "lone_hidden": (0, 100),
+    "stride": (1, 16),
+    "voxel_px": (0.1, 50.0),
+    "passes": (1, 5),
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,10 +57,7 @@ class FusionSettings:
     passes: int = 1
 
     def __post_init__(self) -> None:
-        for name, low, high in _RANGES:
-            value = getattr(self, name)
-            if not low <= value <= high:
-                raise SettingsError(f"{name}: expected {low}..{high}, found {value}")
+        check_ranges("fusion", self, **_RANGES)
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,6 +9,7 @@ import numpy as np
 from capture.arrays import Floats
 from capture.camera import CameraArray
 from capture.errors import CameraError, SettingsError
+from capture.settings import check_ranges
 
 _PARALLEL = 1e-3  # smallest eigenvalue of the meeting-point system, of a possible 1
 
@@ -38,8 +39,7 @@ class PairSettings:
                 "pair angles: expected 0 < angle_min_deg < angle_best_deg < angle_max_deg <= "
                 f"angle_last_deg < 90, found {angles}"
             )
-        if not 1 <= self.partners <= 64:
-            raise SettingsError(f"partners: expected 1..64, found {self.partners}")
+        check_ranges("pairs", self, partners=(1, 64))
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,8 @@ import numba
 import numpy as np
 
 from capture.arrays import Floats, Floats32, Ints, Ints32, check_finite, check_shape
-from capture.errors import SettingsError, ShapeError
+from capture.errors import ShapeError
+from capture.settings import check_ranges
 from recon.rectify import Rectification
 
 _NEAREST_MM = 1.0  # corners nearer to the baseline's plane than this have no disparity
@@ -37,8 +38,7 @@ class PriorMesh:
 
     def __post_init__(self) -> None:
         _check_mesh(self.vertices, self.triangles)
-        if not 0.01 <= self.reach_mm <= 1000.0:
-            raise SettingsError(f"reach_mm: expected 0.01..1000, found {self.reach_mm}")
+        check_ranges("prior", self, reach_mm=(0.01, 1000.0))
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,7 +24,7 @@ from capture.errors import (
 )
 from capture.product import hash_file, is_current, replacing, stage_record, write_record
 from capture.progress import Progress, silent
-from capture.settings import check_range
+from capture.settings import check_ranges
 from capture.take import Take
 from recon.aim import aimed, estimate_aims
 from recon.depth_maps import write_depth_maps
@@ -96,9 +96,9 @@ class ReconSettings:
     frames_at_once: int = 2
 
     def __post_init__(self) -> None:
-        check_range("recon.workers", self.workers, 0, 1024)
-        check_range("recon.frames_at_once", self.frames_at_once, 1, 64)
-        check_range("recon.prior_mm", self.prior_mm, 0.1, 1000.0)
+        check_ranges(
+            "recon", self, workers=(0, 1024), frames_at_once=(1, 64), prior_mm=(0.1, 1000.0)
+        )
         if self.depth_maps and not self.mesh:
             raise SettingsError(
                 "recon.depth_maps = True with recon.mesh = False: depth maps are rendered from "

@@ -12,6 +12,7 @@ import numpy as np
 from capture.arrays import Floats, Floats32, Image
 from capture.camera import CameraArray
 from capture.errors import CameraError, SettingsError
+from capture.settings import check_ranges
 from recon.disparity import (
     DisparityMap,
     DisparitySettings,
@@ -59,9 +60,7 @@ class StereoSettings:
     def __post_init__(self) -> None:
         if self.centre_mm is not None and not np.isfinite(self.centre_mm).all():
             raise SettingsError(f"centre_mm: expected three finite numbers, found {self.centre_mm}")
-        for name in ("depth_mm", "extent_mm"):
-            if not 1.0 <= getattr(self, name) <= 1e5:
-                raise SettingsError(f"{name}: expected 1..100000, found {getattr(self, name)}")
+        check_ranges("stereo", self, depth_mm=(1.0, 1e5), extent_mm=(1.0, 1e5))
 
 
 @dataclass(frozen=True, eq=False)

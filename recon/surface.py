@@ -14,8 +14,9 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from capture.arrays import Bools, Floats, Floats32, Ints32, check_finite, check_shape
-from capture.errors import SettingsError, SolveError, TakeError
+from capture.errors import SolveError, TakeError
 from capture.product import replacing
+from capture.settings import check_ranges
 from recon.fusion import Points
 
 _MARGIN = 1.1  # Poisson's cube over the extent of the points
@@ -61,14 +62,11 @@ class SurfaceSettings:
     threads: int = 1
 
     def __post_init__(self) -> None:
-        for name, low, high in (
-            ("cell_spacings", 0.5, 20.0), ("depth_max", 5, 12), ("evidence_spacings", 1.0, 50.0),
-            ("lone_spacings", 0.0, 50.0),
-            ("component_share", 0.0, 1.0), ("threads", 1, 256),
-        ):  # fmt: skip
-            value = getattr(self, name)
-            if not low <= value <= high:
-                raise SettingsError(f"{name}: expected {low}..{high}, found {value}")
+        check_ranges(
+            "surface", self, cell_spacings=(0.5, 20.0), depth_max=(5, 12),
+            evidence_spacings=(1.0, 50.0), lone_spacings=(0.0, 50.0), component_share=(0.0, 1.0),
+            threads=(1, 256),
+        )  # fmt: skip
 
 
 def poisson_scan(points: Points, settings: SurfaceSettings) -> Scan:

@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capture.arrays import Bools, Floats
-from capture.errors import InputError, SettingsError, raise_all
+from capture.errors import InputError, raise_all
 from capture.product import is_current, stage_record, write_record
 from capture.progress import Progress, silent
+from capture.settings import check_ranges
 from rig.face_rig import FaceRig, read_rig, write_rig
 from rig.neutral_frame import approximate_neutral, choose_neutral_frame
 from rig.report import describe_solve, write_report
@@ -70,25 +71,12 @@ class RigSettings:
     neutral_frame: int = -1
 
     def __post_init__(self) -> None:
-        ranges = {
-            "iterations": (1, 100),
-            "relative_change": (0.0, 1.0),
-            "sparsity_mm2": (0.0, 1e3),
-            "smoothness": (0.0, 1e3),
-            "evidence": (0.0, 1.0),
-            "variation": (1e-3, 1e3),
-            "gradient_mm2": (0.0, 1e6),
-            "offset": (1e-6, 1e6),
-            "neutral_offset": (1e-6, 1e6),
-            "mask_tolerance": (0.0, 0.5),
-            "neutral_frame": (-1, 1_000_000),
-        }
-        problems = [
-            f"{name}: must lie in {low}..{high}, found {getattr(self, name)}"
-            for name, (low, high) in ranges.items()
-            if not low <= getattr(self, name) <= high
-        ]
-        raise_all("rig settings", problems, SettingsError)
+        check_ranges(
+            "rig", self, iterations=(1, 100), relative_change=(0.0, 1.0), sparsity_mm2=(0.0, 1e3),
+            smoothness=(0.0, 1e3), evidence=(0.0, 1.0), variation=(1e-3, 1e3),
+            gradient_mm2=(0.0, 1e6), offset=(1e-6, 1e6), neutral_offset=(1e-6, 1e6),
+            mask_tolerance=(0.0, 0.5), neutral_frame=(-1, 1_000_000),
+        )  # fmt: skip
 
     def schedule(self) -> Schedule:
         """The same settings as the solver takes them."""

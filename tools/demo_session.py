@@ -15,7 +15,7 @@ from capture.product import replacing
 from capture.progress import Progress, silent
 from capture.recorder import RecordSettings
 from capture.session import Session, Shot, record_take
-from capture.settings import check_range
+from capture.settings import check_ranges
 from capture.take import Take
 from tools.actor.array import make_array
 from tools.actor.scene import ActorScene, SceneSettings, act_times
@@ -48,11 +48,10 @@ class DemoSettings:
     """Triggers a second."""
 
     def __post_init__(self) -> None:
-        check_range("demo.seed", self.seed, 0)
-        check_range("demo.size_px", self.size_px, 256, 4096)
-        check_range("demo.board_frames", self.board_frames, 8, 200)
-        check_range("demo.expression_frames", self.expression_frames, 4, 1000)
-        check_range("demo.rate_hz", self.rate_hz, 1, 500)
+        check_ranges(
+            "demo", self, seed=(0, float("inf")), size_px=(256, 4096), board_frames=(8, 200),
+            expression_frames=(4, 1000), rate_hz=(1, 500),
+        )  # fmt: skip
 
 
 def record_session(

@@ -23,7 +23,7 @@ from capture.product import (
     write_record,
 )
 from capture.progress import Progress, silent
-from capture.settings import check_range
+from capture.settings import check_ranges
 from capture.take import Take
 from recon.mesh import Mesh, read_obj, write_obj
 from recon.scan import load_scan, reconstruct
@@ -67,20 +67,14 @@ class NeutralSettings:
     landmark_last_share: float = 0.02
 
     def __post_init__(self) -> None:
-        check_range("neutral.steps", self.steps, 2, 200)
-        for name, low, high in (
-            ("bending_first_mm", 0.1, 1000.0),
-            ("bending_last_mm", 0.1, 1000.0),
-            ("reach_first_mm", 0.5, 200.0),
-            ("reach_last_mm", 0.5, 200.0),
-            ("angle_first_deg", 5.0, 89.0),
-            ("angle_last_deg", 5.0, 89.0),
-            ("normal_first_mm", 0.01, 500.0),
-            ("normal_last_mm", 0.01, 500.0),
-            ("landmark_first_share", 1e-6, 100.0),
-            ("landmark_last_share", 1e-6, 100.0),
-        ):
-            check_range(f"neutral.{name}", getattr(self, name), low, high)
+        check_ranges(
+            "neutral", self, steps=(2, 200),
+            bending_first_mm=(0.1, 1000.0), bending_last_mm=(0.1, 1000.0),
+            reach_first_mm=(0.5, 200.0), reach_last_mm=(0.5, 200.0),
+            angle_first_deg=(5.0, 89.0), angle_last_deg=(5.0, 89.0),
+            normal_first_mm=(0.01, 500.0), normal_last_mm=(0.01, 500.0),
+            landmark_first_share=(1e-6, 100.0), landmark_last_share=(1e-6, 100.0),
+        )  # fmt: skip
 
     def schedule(self) -> list[Step]:
         """The steps, each pair mixed geometrically from first to last."""

@@ -25,7 +25,7 @@ from capture.camera import CameraArray
 from capture.errors import ShapeError, TakeError
 from capture.product import hash_file, is_current, replacing, stage_record, write_record
 from capture.progress import Progress, silent
-from capture.settings import check_range
+from capture.settings import check_ranges
 from capture.take import Take
 from recon.images import mono
 from recon.mesh import Mesh
@@ -83,15 +83,13 @@ class TrackSettings:
     use_scan: bool = True
 
     def __post_init__(self) -> None:
-        ranges = {
-            "spacing_mm": (0.2, 100.0), "search_mm": (0.1, 50.0), "passes": (1, 10),
-            "half_window_px": (3, 20), "half_window_coarse_px": (3, 20),
-            "bending_coarse_mm": (0.05, 100.0), "bending_mm": (0.05, 100.0),
-            "min_cosine": (0.05, 0.95), "min_correlation": (0.0, 0.99), "search_stride": (1, 100),
-            "rotation_iterations": (1, 10), "extrapolation": (0.0, 1.0),
-        }  # fmt: skip
-        for name, (low, high) in ranges.items():
-            check_range(f"track.{name}", getattr(self, name), low, high)
+        check_ranges(
+            "track", self, spacing_mm=(0.2, 100.0), search_mm=(0.1, 50.0), passes=(1, 10),
+            half_window_px=(3, 20), half_window_coarse_px=(3, 20),
+            bending_coarse_mm=(0.05, 100.0), bending_mm=(0.05, 100.0), min_cosine=(0.05, 0.95),
+            min_correlation=(0.0, 0.99), search_stride=(1, 100), rotation_iterations=(1, 10),
+            extrapolation=(0.0, 1.0),
+        )  # fmt: skip
 
 
 def track(

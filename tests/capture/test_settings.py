@@ -7,7 +7,7 @@ from typing import Literal
 import pytest
 
 from capture.errors import SettingsError
-from capture.settings import check_range, read_settings, settings_to_toml
+from capture.settings import check_ranges, read_settings, settings_to_toml
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,7 +20,7 @@ class Knobs:
     dense: bool = True
 
     def __post_init__(self) -> None:
-        check_range("knobs.voxel_mm", self.voxel_mm, 0.0, 5.0, open_low=True)
+        check_ranges("knobs", self, voxel_mm=(0.1, 5.0), rounds=(1, float("inf")))
 
 
 def write(folder: Path, text: str) -> Path:
@@ -48,8 +48,8 @@ def test_a_stage_without_a_table_gets_its_defaults(tmp_path: Path) -> None:
         ("[knobs]\nrounds = true\n", ["knobs.rounds", "int", "True"]),
         ('[knobs]\nmode = "best"\n', ["knobs.mode", "best"]),
         ("[knobs]\nrange_mm = [1.0]\n", ["knobs.range_mm", "[1.0]"]),
-        ("[knobs]\nvoxel_mm = 0\n", ["knobs.voxel_mm", "above 0"]),
-        ("[knobs]\nvoxel_mm = nan\n", ["knobs.voxel_mm", "above 0"]),
+        ("[knobs]\nvoxel_mm = 0\n", ["knobs.voxel_mm", "at least 0.1"]),
+        ("[knobs]\nvoxel_mm = nan\n", ["knobs.voxel_mm", "at least 0.1"]),
         ("[knobs\n", ["settings.toml", "TOML"]),
     ],
 )
@@ -67,3 +67,14 @@ def test_all_problems_are_listed_at_once(tmp_path: Path) -> None:
     with pytest.raises(SettingsError) as caught:
         read_settings(path, {"knobs": Knobs})
     assert all(word in str(caught.value) for word in ("voxel_m", "rounds", "other"))
+
+
+def test_every_setting_out_of_range_is_named() -> None:
+    with pytest.raises(SettingsError) as caught:
+        Knobs(voxel_mm=float("nan"), rounds=0)
+    assert str(caught.value) == (
+        "knobs.voxel_mm = nan: must be at least 0.1 and at most 5; "
+        "knobs.rounds = 0: must be at least 1"
+    )
+    assert Knobs(voxel_mm=0.1).voxel_mm == 0.1
+    assert Knobs(voxel_mm=5.0, rounds=10**9).rounds == 10**9

@@ -65,7 +65,9 @@ def test_the_seed_stays_in_its_range_at_both_signs(pair):
 
 
 def test_settings_name_what_is_wrong():
-    with pytest.raises(SettingsError, match=r"ncc_min: expected 0\.0\.\.0\.99, found 1\.5"):
+    with pytest.raises(
+        SettingsError, match=r"ncc_min = 1\.5: must be at least 0 and at most 0\.99"
+    ):
         DisparitySettings(ncc_min=1.5)
     with pytest.raises(SettingsError, match="seed_block: expected an odd number, found 4"):
         DisparitySettings(seed_block=4)

@@ -108,7 +108,7 @@ def _bilinear(plane: np.ndarray, column: float, row: float) -> float:
 
 
 def test_a_setting_out_of_range_is_named():
-    with pytest.raises(SettingsError, match="agree_px: expected"):
+    with pytest.raises(SettingsError, match=r"fusion\.agree_px = .*: must be"):
         FusionSettings(agree_px=-1.0)
 
 

@@ -207,5 +207,5 @@ def test_refuses_what_it_cannot_solve(actor: Actor, tmp_path: Path) -> None:
 
 
 def test_settings_out_of_range_are_named() -> None:
-    with pytest.raises(SettingsError, match=r"offset: must lie in .* found 0"):
+    with pytest.raises(SettingsError, match=r"offset = 0.*: must be at least 1e-06"):
         RigSettings(offset=0.0)

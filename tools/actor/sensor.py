@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from capture.arrays import Floats32, Image
 from capture.errors import SettingsError
+from capture.settings import check_ranges
 
 _RANGES = {
     "gain": (0.05, 20.0), "exposure": (0.05, 20.0), "shot_dn": (0.0, 1.0), "read_dn": (0.0, 50.0),
@@ -43,12 +44,7 @@ class Sensor:
     bits: int = 8
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            if field.name in _RANGES:
-                low, high = _RANGES[field.name]
-                value = getattr(self, field.name)
-                if not low <= value <= high:
-                    raise SettingsError(f"{field.name}: must lie in {low}..{high}, found {value}")
+        check_ranges("sensor", self, **_RANGES)
         if self.bits not in (8, 12, 16):
             raise SettingsError(f"bits: must be 8, 12 or 16, found {self.bits}")
 

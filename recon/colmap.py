@@ -1,8 +1,8 @@
 """The seam to COLMAP: models in and out, and bundle adjustment of an array in the board's frame.
 
-The only module that imports pycolmap. COLMAP puts the centre of the first pixel at 0.5, we put it
-at 0: that half pixel is added to keypoints and principal points on the way in, taken away on the
-way out, here and nowhere else.
+The only module that imports pycolmap, but for a bench that has its fusion as an opponent. COLMAP
+puts the centre of the first pixel at 0.5, we put it at 0: that half pixel is added to keypoints and
+principal points on the way in, taken away on the way out, here and nowhere else.
 """
 
 from __future__ import annotations

@@ -15,8 +15,8 @@ FLOORS = ("capture", "recon", "track", "rig", "tools")
 FORBIDDEN = {"utils", "util", "common", "helpers", "misc", "core", "base", "types"}
 DATA_TABLES: set[str] = set()  # files that hold only a table of numbers, excepted by name
 VENDORS = {
-    "pycolmap": r"recon/colmap\.py",
-    "open3d": r"recon/surface\.py",
+    "pycolmap": r"recon/colmap\.py|tools/bench/fusion_opponents\.py",
+    "open3d": r"recon/surface\.py|tools/bench/fusion_opponents\.py",
     "moderngl": r"(track/(raster|gpu)\w*\.py|tools/actor/\w+\.py)",
     "pxr": r"rig/export_usd\.py",
     "pygltflib": r"rig/export_gltf\.py",

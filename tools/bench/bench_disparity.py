@@ -17,7 +17,6 @@ import json
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,6 +37,7 @@ from recon.png import decode_png
 from recon.rectify import Rectification, rectification, resample, spline_coefficients
 from recon.scan import ReconSettings
 from recon.surface import SurfaceQuery
+from tools.bench.cost import measured
 
 _FACING = 0.35  # 70 degrees
 _FACE_VERTICES = 6706  # of the ICT face, where the truth names no region
@@ -262,24 +262,9 @@ def _work(way: str, limits: tuple[float, float], path: Path) -> None:
     match = matchers()[way]
     corner = [np.ascontiguousarray(view[:96, :160]) for view in (left, right)]
     match(PairCase(corner[0], corner[1], (0.0, 30.0), case.truth))  # compiled code is loaded
-    before = _memory_mib("VmRSS")
-    Path("/proc/self/clear_refs").write_text("5", encoding="ascii")  # the peak starts here
-    wall, processor = time.perf_counter(), time.process_time()
-    found = match(case)
-    cost = {
-        "wall_s": round(time.perf_counter() - wall, 2),
-        "cpu_s": round(time.process_time() - processor, 2),
-        "peak_mib": _memory_mib("VmHWM"),
-        "own_mib": _memory_mib("VmHWM") - before,
-    }
+    found, cost = measured(lambda: match(case))
     np.save(path.with_suffix(".out.npy"), found)
     print(json.dumps(cost))
-
-
-def _memory_mib(key: str) -> int:
-    """Of this process, from Linux: getrusage would count what the parent held when it forked."""
-    lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
-    return next(int(line.split()[1]) for line in lines if line.startswith(key)) // 1024
 
 
 def _cropped(

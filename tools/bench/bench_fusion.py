@@ -1,12 +1,16 @@
 """Ways of turning the same depth views into a surface, on one frame of a visiting take, in one run.
 
     python -m tools.bench.bench_fusion TAKE FRAME [--score SCORE_SCAN.py] [--cells 0.7,0.9,1.4]
+        [--out FOLDER]
 
-The pairs are matched once. Then each way is timed by itself: the fused points as they are, and
-the screened Poisson surface through them with several finest cells, mm. `--score` names a script
-called with TAKE FRAME SCAN that prints one JSON line, such as score_scan.py; points are scored
-as a mesh of one tiny triangle each. One JSON line a way: seconds of wall clock and of processor,
-peak memory of the process so far, and the score.
+The pairs are matched once, and their aims corrected where the stage would. Then each way is timed
+by itself: our points as they are, the screened Poisson surface through them with several finest
+cells, mm; Open3D's TSDF of the same depth maps; COLMAP's `stereo_fusion` of them, with its own
+settings and with ours (three pixels, `agree_px` of depth), its points as they are and under the
+same Poisson surface. `--score` names a script called with TAKE FRAME SCAN that prints one JSON
+line, such as score_scan.py; points are scored as a mesh of one tiny triangle each. One JSON line a
+way: seconds of wall clock and of processor, memory beyond what was held before, and the score; of a
+Poisson surface they are those of the surface alone. At the end the same as a Markdown table.
 """
 
 from __future__ import annotations
@@ -14,26 +18,40 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import resource
 import subprocess
 import sys
 import tempfile
-import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
 from capture.camera_file import read_cameras
-from recon.fusion import Points, fuse
+from recon.aim import aimed, estimate_aims
+from recon.fusion import DepthView, Points, fuse
 from recon.png import decode_png
 from recon.scan import ReconSettings
 from recon.stereo import match_views
 from recon.surface import Scan, SurfaceSettings, poisson_scan, write_ply
+from tools.bench.cost import measured
+from tools.bench.fusion_opponents import (
+    ColmapSettings,
+    TsdfSettings,
+    colmap_fusion,
+    footprint_mm,
+    tsdf_scan,
+)
 
-_Value = TypeVar("_Value")
 _TINY_MM = 1e-3
+_TSDF_PAIRS = (1, 2, 3)
+_SCORES = (
+    ("median mm", "median", 1.0, "{:.3f}"),
+    ("rms mm", "rms", 1.0, "{:.3f}"),
+    ("beyond 1 mm", "outliers_1mm", 100.0, "{:.3f} %"),
+    ("complete 0.5 mm", "completeness_05", 100.0, "{:.1f} %"),
+    ("complete 0.2 mm", "completeness_02", 100.0, "{:.1f} %"),
+)
 
 
 def main() -> None:
@@ -43,23 +61,70 @@ def main() -> None:
     parser.add_argument("frame", type=int)
     parser.add_argument("--score", type=Path, help="script called with TAKE FRAME SCAN")
     parser.add_argument("--cells", default="0.7,0.9,1.4", help="finest Poisson cells, mm")
+    parser.add_argument("--out", type=Path, help="folder to keep the scans in")
     arguments = parser.parse_args()
     settings, workers = ReconSettings(), os.cpu_count() or 1
-    cameras = read_cameras(arguments.take / "cameras.json")
+    views, cost = measured(lambda: matched(arguments.take, arguments.frame, settings, workers))
+    print(json.dumps({"way": "match", "pairs": len(views), **cost}), flush=True)
+    cells = [float(cell) for cell in arguments.cells.split(",")]
+    with tempfile.TemporaryDirectory() as folder:
+        report = _Report(arguments, arguments.out or Path(folder))
+        _run(views, settings, cells, workers, report)
+    print("\n" + report.table())
+
+
+def matched(take: Path, frame: int, settings: ReconSettings, workers: int) -> list[DepthView]:
+    """The depth views of one frame, as the stage gives them to fusion."""
+    cameras = read_cameras(take / "cameras.json")
     images = {}
     for camera in cameras:
-        path = arguments.take / camera.name / f"{arguments.frame:04d}.png"
+        path = take / camera.name / f"{frame:04d}.png"
         images[camera.name] = decode_png(path.read_bytes(), path)
-    pairs, times = _timed(lambda: match_views(cameras, images, settings.stereo(), workers=workers))
-    print(json.dumps({"way": "match", **times}), flush=True)
-    views = [pair.view for pair in pairs if pair.view is not None]
-    points, times = _timed(lambda: fuse(views, settings.fusion(), workers=workers))
-    row = {"way": "points", "count": len(points), "rejected": dict(points.rejected)}
-    _report({**row, **times}, _as_triangles(points), arguments)
-    for cell in arguments.cells.split(","):
-        scan, times = _timed(_poisson(points, float(cell)))
-        row = {"way": f"poisson {cell} mm", "count": len(scan.vertices)}
-        _report({**row, **times}, scan, arguments)
+    pairs = match_views(cameras, images, settings.stereo(), workers=workers)
+    aims = estimate_aims(cameras, pairs)
+    true = [aimed(pair, aims) for pair in pairs] if aims.correct else pairs
+    return [pair.view for pair in true if pair.view is not None]
+
+
+def alike(views: Sequence[DepthView], settings: ReconSettings) -> ColmapSettings:
+    """COLMAP's settings nearest to ours: as many must agree, to the same part of a pixel."""
+    shares = []
+    for view in views:
+        offset = view.geometry.left_column - view.geometry.right_column
+        known = view.disparity[np.isfinite(view.disparity)]
+        if len(known):
+            shares.append(settings.agree_px / (float(np.median(known)) - offset))
+    return ColmapSettings(
+        pixels=settings.agreeing + 1,
+        reprojection_px=1.0,
+        depth_share=float(np.median(shares)),
+        normal_deg=25.0,  # of single pixels: a plane through a few of them turns so much by noise
+    )
+
+
+def _run(
+    views: Sequence[DepthView],
+    settings: ReconSettings,
+    cells: Sequence[float],
+    workers: int,
+    report: _Report,
+) -> None:
+    points, cost = measured(lambda: fuse(views, settings.fusion(), workers=workers))
+    report.add("ours, points", as_triangles(points), cost)
+    for cell in cells:
+        scan, cost = measured(_poisson(points, cell))
+        report.add(f"ours, Poisson {cell:g} mm", scan, cost)
+    for pairs in _TSDF_PAIRS:
+        tsdf = TsdfSettings(voxel_px=settings.voxel_px, pairs=pairs)
+        scan, cost = measured(lambda chosen=tsdf: tsdf_scan(views, chosen))  # type: ignore[misc]
+        report.add(f"TSDF, {pairs} pairs at least", scan, cost)
+    spacing = settings.voxel_px * footprint_mm(views)
+    cell = settings.cell_spacings * spacing
+    for name, chosen in (("its", ColmapSettings()), ("our", alike(views, settings))):
+        theirs, cost = measured(_colmap(views, chosen, spacing, workers))
+        report.add(f"stereo_fusion, {name} settings, points", as_triangles(theirs), cost)
+        scan, cost = measured(_poisson(theirs, cell))
+        report.add(f"stereo_fusion, {name} settings, Poisson {cell:.1f} mm", scan, cost)
 
 
 def _poisson(points: Points, cell_mm: float) -> Callable[[], Scan]:
@@ -67,16 +132,13 @@ def _poisson(points: Points, cell_mm: float) -> Callable[[], Scan]:
     return lambda: poisson_scan(points, settings)
 
 
-def _timed(work: Callable[[], _Value]) -> tuple[_Value, dict[str, float]]:
-    wall, processor = time.perf_counter(), time.process_time()
-    value = work()
-    return value, {
-        "wall_s": round(time.perf_counter() - wall, 2),
-        "cpu_s": round(time.process_time() - processor, 2),
-    }
+def _colmap(
+    views: Sequence[DepthView], settings: ColmapSettings, spacing_mm: float, workers: int
+) -> Callable[[], Points]:
+    return lambda: colmap_fusion(views, settings, spacing_mm, workers=workers)
 
 
-def _as_triangles(points: Points) -> Scan:
+def as_triangles(points: Points) -> Scan:
     """Each point as a triangle far below the noise, so that points and meshes score alike."""
     corners = _TINY_MM * np.eye(3, dtype=np.float32)
     vertices = (points.positions[:, None, :] + corners[None]).reshape(-1, 3)
@@ -86,19 +148,43 @@ def _as_triangles(points: Points) -> Scan:
     )
 
 
-def _report(row: dict[str, Any], scan: Scan, arguments: argparse.Namespace) -> None:
-    row["peak_mib"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
-    if arguments.score:
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "scan.ply"
-            write_ply(path, scan)
-            command = [sys.executable, str(arguments.score), str(arguments.take)]
+class _Report:
+    """Rows as they come, scored and printed."""
+
+    def __init__(self, arguments: argparse.Namespace, folder: Path) -> None:
+        self._arguments, self._folder = arguments, folder
+        self._rows: list[dict[str, Any]] = []
+        folder.mkdir(parents=True, exist_ok=True)
+
+    def add(self, way: str, scan: Scan, cost: dict[str, float]) -> None:
+        """Write a scan, have it scored, print its row."""
+        row: dict[str, Any] = {"way": way, "triangles": len(scan.triangles), **cost}
+        path = self._folder / f"scan{len(self._rows)}.ply"
+        write_ply(path, scan)
+        if self._arguments.score:
+            command = [sys.executable, str(self._arguments.score), str(self._arguments.take)]
             done = subprocess.run(
-                [*command, str(arguments.frame), str(path)],
+                [*command, str(self._arguments.frame), str(path)],
                 check=True, capture_output=True, text=True,
             )  # fmt: skip
-        row["score"] = json.loads(done.stdout.splitlines()[-1])
-    print(json.dumps(row), flush=True)
+            row["score"] = json.loads(done.stdout.splitlines()[-1])
+        if not self._arguments.out:
+            path.unlink()
+        self._rows.append(row)
+        print(json.dumps(row), flush=True)
+
+    def table(self) -> str:
+        """All rows in Markdown."""
+        head = ["way", *(title for title, *_ in _SCORES), "processor s", "own MiB"]
+        lines = [head, ["---"] * len(head)]
+        for row in self._rows:
+            score = row.get("score", {})
+            cells = [
+                form.format(scale * score[key]) if key in score else ""
+                for _, key, scale, form in _SCORES
+            ]
+            lines.append([row["way"], *cells, f"{row['cpu_s']:.1f}", f"{row['own_mib']:.0f}"])
+        return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 if __name__ == "__main__":

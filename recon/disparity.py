@@ -33,6 +33,7 @@ class Reason(IntEnum):
     LEFT_RIGHT = 6  # the right view's own match disagrees
     FRAGMENT = 7  # part of a patch too small to trust
     EDGE = 8  # on the border of the matched area, where windows reach beyond the surface
+    HIGHLIGHT = 9  # too bright to tell how bright, here or where it lies in the right view
 
 
 _RANGES: dict[str, tuple[float, float]] = {
@@ -236,8 +237,8 @@ def match_pair(
     """Disparity of a rectified pair at full resolution.
 
     Args:
-        left: (H, W) reference view; NaN off the image.
-        right: (H, W) other view; NaN off the image.
+        left: (H, W) reference view; NaN off the image, inf where it is too bright to tell.
+        right: (H, W) other view, likewise.
         limits_px: range of disparities searched by the seed.
         settings: see there.
         seeded: gives the seed (h, w) of the two views at so many halvings, where something better
@@ -246,6 +247,8 @@ def match_pair(
     Returns:
         Disparity, its confidence, and a reason for each pixel that has none.
     """
+    bright = (np.isposinf(left), np.isposinf(right))
+    left, right = _without(left, bright[0]), _without(right, bright[1])
     levels = pyramid(left, right, settings.seed_px)
     factor = 2 ** (len(levels) - 1)
     if seeded is None:
@@ -257,7 +260,11 @@ def match_pair(
     if settings.jump_px > 0 and len(levels) == 1:
         refined = _stepped(seed, refined, settings)
     mirrored = _right_view(refined, settings)
-    return _judge(left, refined, mirrored, settings)
+    return _judge(left, bright, refined, mirrored, settings)
+
+
+def _without(view: Floats32, mask: Bools) -> Floats32:
+    return np.where(mask, np.float32(np.nan), view) if mask.any() else view
 
 
 def pyramid(left: Floats32, right: Floats32, size_px: int) -> list[tuple[Floats32, Floats32]]:
@@ -340,6 +347,7 @@ def _nearest_landing(disparity: Floats32, good: Bools) -> Floats32:  # pragma: n
 
 def _judge(
     left: Floats32,
+    bright: tuple[Bools, Bools],
     refined: Refined,
     mirrored: Floats32,
     settings: DisparitySettings,
@@ -352,13 +360,16 @@ def _judge(
         reason[(reason == 0) & where] = why
 
     noise = max(noise_sigma(np.nan_to_num(left)), 1e-5)
-    fail(np.isnan(left), Reason.OUTSIDE)
+    columns = np.arange(disparity.shape[1], dtype=np.float32)[None] - disparity
+    target = np.clip(np.nan_to_num(np.rint(columns)), 0, disparity.shape[1] - 1).astype(np.int64)
+    fail(np.isnan(left) & ~bright[0], Reason.OUTSIDE)
+    highlight = bright[0] | np.take_along_axis(bright[1], target, axis=1) & np.isfinite(disparity)
+    failed = np.isnan(disparity) | ~(refined.ncc >= settings.ncc_min)
+    fail(highlight & failed, Reason.HIGHLIGHT)
     fail(np.isnan(disparity), Reason.NO_SEED)
     fail(_local_deviation(left, settings.radius) < settings.contrast_min * noise, Reason.NO_TEXTURE)
     fail(~(refined.ncc >= settings.ncc_min), Reason.LOW_CORRELATION)
     fail(~(refined.sigma_px <= settings.sigma_max_px), Reason.UNCERTAIN)
-    columns = np.arange(disparity.shape[1], dtype=np.float32)[None] - disparity
-    target = np.clip(np.nan_to_num(np.rint(columns)), 0, disparity.shape[1] - 1).astype(np.int64)
     seen = np.take_along_axis(mirrored, target, axis=1)
     fail(seen - disparity > settings.left_right_px, Reason.LEFT_RIGHT)
     kept = np.where(reason == 0, disparity, np.float32(np.nan))

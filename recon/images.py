@@ -4,15 +4,19 @@ from __future__ import annotations
 
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from capture.arrays import Floats, Floats32, Image
+from capture.arrays import Bools, Floats, Floats32, Image
 from capture.errors import ShapeError
 
 # Equal weights for the two outer channels: RGB and BGR give the same grey.
 _OUTER, _MIDDLE = np.float32(0.25), np.float32(0.5)
+_WHITES = (1023, 4095, 16383, 65535)  # of 16-bit files with fewer bits in them
+_SOLID_PX = 11
+NEAR_WHITE = 0.985  # of white, from which a value may be where a sensor or a converter saturates
 
 
 def mono(image: Image) -> Floats32:
@@ -46,6 +50,47 @@ def mono(image: Image) -> Floats32:
             values = _OUTER * (values[:, :, 0] + values[:, :, 2]) + _MIDDLE * values[:, :, 1]
     grey: Floats32 = np.ascontiguousarray(values * scale, dtype=np.float32)
     return grey
+
+
+def brightest(image: Image) -> Image:
+    """The brightest of the colour channels (H, W) of an image, of whatever type; alpha is none."""
+    return image if image.ndim == 2 else image[:, :, :3].max(axis=2)
+
+
+def white(image: Image) -> float:
+    """The value of white of an image: that of the fewest bits that hold it, 1 for floats."""
+    if image.dtype == np.uint8:
+        return 255.0
+    if image.dtype == np.uint16:
+        return float(next(value for value in _WHITES if image.max() <= value))
+    return 1.0
+
+
+def clipped(image: Image) -> Bools | None:
+    """Where an image shows no skin but white: solid highlights, a rim of one pixel included.
+
+    A highlight is solid where a disc of eleven pixels fits in. Smaller specks are left in: what
+    lies between them is skin, whose pores on white say more than a mask with holes would leave.
+    The rim is what demosaicing, sharpening and blur have mixed with what is lost.
+
+    Args:
+        image: as `mono` takes it.
+
+    Returns:
+        (H, W): True where any colour channel is at the greatest value of the image, which must be
+        about white: a dark image has such a value too. None when that is so nowhere.
+    """
+    top = brightest(image)
+    greatest = top.max()
+    if greatest < NEAR_WHITE * white(top):
+        return None
+    mask = (top >= greatest).astype(np.uint8)
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (_SOLID_PX, _SOLID_PX))
+    core = cv2.erode(mask, disc, borderType=cv2.BORDER_CONSTANT, borderValue=1)
+    if not core.any():
+        return None
+    solid = cv2.dilate(cv2.dilate(core, disc), np.ones((3, 3), np.uint8))
+    return np.asarray(solid, dtype=np.bool_)
 
 
 def noise_sigma(image: Floats32) -> float:

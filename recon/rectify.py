@@ -178,7 +178,9 @@ def rectification(left: Camera, right: Camera, centre: Floats, extent_mm: float)
     return whole.cropped(int(low[0]), int(low[1]), int(width), int(height))
 
 
-def rectified(geometry: Rectification, side: str, coefficients: Floats32) -> Floats32:
+def rectified(
+    geometry: Rectification, side: str, coefficients: Floats32, clipped: Bools | None = None
+) -> Floats32:
     """One view of a pair, resampled: (height, width), NaN off the recorded image.
 
     The lens is evaluated exactly at every eighth pixel and carried in between by cubics, which is
@@ -188,13 +190,19 @@ def rectified(geometry: Rectification, side: str, coefficients: Floats32) -> Flo
         geometry: of the pair.
         side: "left" or "right".
         coefficients: (H, W) of `spline_coefficients` of the recorded image.
+        clipped: (H, W), where the recorded image is too bright to tell how bright; the view is inf
+            there. None: nowhere.
     """
-    check_shape(coefficients=(coefficients, "* *"))
+    check_shape(coefficients=(coefficients, "H W"))
+    mask = np.zeros((0, 0), np.bool_)
+    if clipped is not None:
+        check_shape(coefficients=(coefficients, "H W"), clipped=(clipped, "H W"))
+        mask = clipped
     across = np.arange(-_GRID, geometry.width + 3 * _GRID, _GRID)
     down = np.arange(-_GRID, geometry.height + 3 * _GRID, _GRID)
     columns, rows = geometry.recorded(side, across, down)
     shape = (geometry.height, geometry.width)
-    return _resample_grid(coefficients, columns, rows, shape)  # type: ignore[no-any-return]
+    return _resample_grid(coefficients, mask, columns, rows, shape)  # type: ignore[no-any-return]
 
 
 def spline_coefficients(image: Floats32) -> Floats32:
@@ -240,10 +248,11 @@ def _resample(
 
 @numba.njit(cache=True, nogil=True)
 def _resample_grid(
-    coefficients: Floats32, columns: Floats, rows: Floats, shape: tuple[int, int]
+    coefficients: Floats32, clipped: Bools, columns: Floats, rows: Floats, shape: tuple[int, int]
 ) -> Floats32:  # pragma: no cover - compiled
     """Spline values (h, w) at positions given at every eighth pixel, beginning at -8."""
     height, width = coefficients.shape
+    all_known = clipped.size == 0
     out = np.full(shape, np.float32(np.nan))
     count = columns.shape[1]
     line_x, line_y = np.empty(count), np.empty(count)
@@ -268,7 +277,10 @@ def _resample_grid(
                 x += w[m] * line_x[start + m]
                 y += w[m] * line_y[start + m]
             if x >= 0.0 and y >= 0.0 and x <= width - 1.0 and y <= height - 1.0:
-                out[i, j] = _spline_value(coefficients, np.float32(x), np.float32(y))
+                if all_known or not clipped[int(y + 0.5), int(x + 0.5)]:
+                    out[i, j] = _spline_value(coefficients, np.float32(x), np.float32(y))
+                else:
+                    out[i, j] = np.float32(np.inf)
     return out
 
 

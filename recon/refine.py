@@ -83,10 +83,35 @@ class Refiner:
 
 
 def spline_rows(image: Floats32) -> Floats32:
-    """Cubic B-spline coefficients of every row of (H, W); NaN counts as the nearest known pixel."""
-    filled = np.where(np.isnan(image), np.float32(0.0), image)
-    rows = ndimage.spline_filter1d(filled, order=3, axis=1, output=np.float32, mode="mirror")
+    """Cubic B-spline coefficients of every row of (H, W); gaps of NaN are bridged straight."""
+    rows = ndimage.spline_filter1d(
+        _bridged(image), order=3, axis=1, output=np.float32, mode="mirror"
+    )
     return np.ascontiguousarray(rows)
+
+
+@numba.njit(cache=True, nogil=True)
+def _bridged(image: Floats32) -> Floats32:  # pragma: no cover - compiled
+    """Unknown pixels on the line between the known ones on either side in the row, or like one."""
+    height, width = image.shape
+    out = image.copy()
+    for i in range(height):
+        last = -1  # known
+        for j in range(width + 1):
+            if j < width and np.isnan(image[i, j]):
+                continue
+            if last < 0 and j == width:
+                out[i] = np.float32(0.0)
+            for k in range(last + 1, j):
+                if last < 0:
+                    out[i, k] = image[i, j] if j < width else np.float32(0.0)
+                elif j == width:
+                    out[i, k] = image[i, last]
+                else:
+                    share = np.float32(k - last) / np.float32(j - last)
+                    out[i, k] = image[i, last] + share * (image[i, j] - image[i, last])
+            last = j
+    return out
 
 
 def row_slope(image: Floats32) -> Floats32:

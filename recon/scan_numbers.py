@@ -14,7 +14,7 @@ from capture.camera import CameraArray
 from recon.aim import Aims
 from recon.disparity import Reason
 from recon.fusion import Points
-from recon.scan_quality import CameraQuality, camera_qualities
+from recon.scan_quality import CameraQuality, camera_qualities, matched_share
 from recon.scan_warnings import camera_warnings, missing_warnings, scan_warnings
 from recon.stereo import PairDepth
 
@@ -56,7 +56,7 @@ def scan_numbers(
     there = CameraArray(tuple(camera for camera in cameras if camera.name in images))
     missing = [camera.name for camera in cameras if camera.name not in images]
     qualities = camera_qualities(there, images, pairs, points)
-    share = _matched_share(pairs)
+    share = matched_share(pairs)
     warnings = scan_warnings(
         qualities,
         matched_share=share,
@@ -107,12 +107,6 @@ def _reasons(pairs: Sequence[PairDepth]) -> dict[str, int]:
     return {
         reason.name: sum(pair.reasons.get(reason.name, 0) for pair in pairs) for reason in Reason
     }
-
-
-def _matched_share(pairs: Sequence[PairDepth]) -> float:
-    reasons = _reasons(pairs)
-    textured = sum(reasons.values()) - reasons["OUTSIDE"] - reasons["NO_TEXTURE"]
-    return reasons["KEPT"] / max(textured, 1)
 
 
 def _plain(value: Any) -> Any:

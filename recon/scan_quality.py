@@ -17,7 +17,7 @@ from capture.arrays import Bools, Floats, Floats32, Image
 from capture.camera import Camera, CameraArray
 from recon.disparity import Reason
 from recon.fusion import Points
-from recon.images import bilinear, mono
+from recon.images import NEAR_WHITE, bilinear, brightest, mono, white
 from recon.row_offset import row_offset
 from recon.stereo import PairDepth
 
@@ -27,10 +27,9 @@ _STRAYS = 1000  # matched pixels of a pair that are looked for in the scan, abou
 _CONFIRMED = 2.5  # spacings of points within which a matched pixel lies on the scan
 _LEAST = 50  # points that a pair must share with the consensus to be counted
 _FINE, _MIDDLE, _COARSE = 0.8, 1.6, 4.0  # px, scales between which sharpness is measured
-_WHITES = (1023, 4095, 16383, 65535)  # of 16-bit files with fewer bits in them
-_NEAR_WHITE = 0.985
 _PLATEAU = 0.005  # share of the skin at its brightest value from which that is a limit
 _CELLS = 56  # of the longer side of what a view sees of the skin
+_TEXTURELESS = (Reason.OUTSIDE, Reason.NO_TEXTURE, Reason.HIGHLIGHT)
 _CLOSE = 12  # holes in the skin up to a twelfth of the view are skin
 
 
@@ -100,7 +99,7 @@ def camera_qualities(
             CameraQuality(
                 name=camera.name,
                 pairs=len(own),
-                matched_share=_matched_share([pairs[k] for k in own]),
+                matched_share=matched_share([pairs[k] for k in own]),
                 neighbours_share=_neighbours_share(index, pairs),
                 unconfirmed_share=_median([stray[k] for k in own]),
                 covered_share=views[index].covered,
@@ -201,7 +200,7 @@ def _look(camera: Camera, image: Image, world: Floats, seen: Bools) -> _View:
 
 def _skin_shares(part: Image, pixels: Floats) -> tuple[float, float]:
     """Of the skin around the points (N, 2), the share at the greatest value, and the share hit."""
-    top = part.max(axis=2) if part.ndim == 3 else part
+    top = brightest(part)
     height, width = top.shape
     step = max(3, max(height, width) // _CELLS)
     mask = np.zeros((height // step + 1, width // step + 1), np.uint8)
@@ -213,18 +212,9 @@ def _skin_shares(part: Image, pixels: Floats) -> tuple[float, float]:
     whole = np.kron(skin, np.ones((step, step), np.uint8))[:height, :width] > 0
     values = top[whole]
     plateau = float((values == values.max()).mean())
-    white = float((values >= _NEAR_WHITE * _white(top)).mean())
+    at_white = float((values >= NEAR_WHITE * white(top)).mean())
     covered = float(mask.sum() / max(int(skin.sum()), 1))
-    return max(white, plateau if plateau > _PLATEAU else 0.0), covered
-
-
-def _white(image: Image) -> float:
-    """The value of white of an image: that of the fewest bits that hold it."""
-    if image.dtype == np.uint8:
-        return 255.0
-    if image.dtype == np.uint16:
-        return float(next(white for white in _WHITES if image.max() <= white))
-    return 1.0
+    return max(at_white, plateau if plateau > _PLATEAU else 0.0), covered
 
 
 def _brightness(pair: PairDepth, shared: _Shared, views: Sequence[_View]) -> float:
@@ -275,9 +265,10 @@ def _balanced(pairs: Sequence[PairDepth], differences: Sequence[float], count: i
     return out
 
 
-def _matched_share(pairs: Sequence[PairDepth]) -> float:
+def matched_share(pairs: Sequence[PairDepth]) -> float:
+    """Of the pixels of all pairs that show texture, the share that was matched; NaN of none."""
     counts = {reason: sum(pair.reasons.get(reason.name, 0) for pair in pairs) for reason in Reason}
-    textured = sum(counts.values()) - counts[Reason.OUTSIDE] - counts[Reason.NO_TEXTURE]
+    textured = sum(counts.values()) - sum(counts[reason] for reason in _TEXTURELESS)
     return counts[Reason.KEPT] / textured if textured else float("nan")
 
 
@@ -285,7 +276,7 @@ def _neighbours_share(index: int, pairs: Sequence[PairDepth]) -> float:
     """Matched share of the pairs that a camera's partners form with others."""
     ends = [{pair.pair.left, pair.pair.right} for pair in pairs]
     partners = set().union(*(end for end in ends if index in end)) - {index}
-    return _matched_share(
+    return matched_share(
         [pair for pair, end in zip(pairs, ends, strict=True) if index not in end and end & partners]
     )
 

@@ -57,7 +57,7 @@ def scan_warnings(
             f"all cameras: pairs agree to {agreement_p95_mm:.2f} mm (95 %) where a pixel covers "
             f"{footprint_mm:.2f} mm: calibrate again"
         )
-    if matched_share < _MATCHED:
+    if not matched_share >= _MATCHED:
         out.append(
             f"all cameras: {_percent(matched_share)} of the textured pixels were matched: check "
             "focus, light, and that the calibration is of this array"

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from capture.arrays import Floats, Floats32, Image
+from capture.arrays import Bools, Floats, Floats32, Image
 from capture.camera import CameraArray
 from capture.errors import CameraError, SettingsError
 from capture.settings import check_ranges
@@ -22,7 +22,7 @@ from recon.disparity import (
     seed_near,
 )
 from recon.fusion import DepthView
-from recon.images import mono
+from recon.images import clipped, mono
 from recon.pairs import PairSettings, StereoPair, scene_centre, select_pairs
 from recon.prior import PriorMesh, prior_disparity
 from recon.rectify import (
@@ -78,6 +78,13 @@ class PairDepth:
     view: DepthView | None
     coverage: float
     reasons: Mapping[str, int]
+
+
+class _Plane(NamedTuple):
+    """An image (H, W) as views are drawn from it, and where it is clipped."""
+
+    coefficients: Floats32
+    clipped: Bools | None
 
 
 class _Found(NamedTuple):
@@ -154,7 +161,7 @@ def match_views(
                 return PairDepth(pair, None, 0.0, {Reason.NO_SEED.name: pixels})
             crop = _window(geometry, small, found.coarse)
             limits = (found.low * 2.0**level, found.high * 2.0**level)
-            views = (rectified(crop, "left", left[0]), rectified(crop, "right", right[0]))
+            views = (rectified(crop, "left", *left[0]), rectified(crop, "right", *right[0]))
             if prior is None:
                 result = match_pair(*views, limits, settings.matching)
             else:
@@ -179,10 +186,14 @@ def _search_halvings(geometry: Rectification) -> int:
 
 def _planes(
     cameras: CameraArray, images: Mapping[str, Image], index: int, wanted: Set[int]
-) -> dict[int, Floats32]:
-    """Spline coefficients of an image, by how often it was halved before."""
+) -> dict[int, _Plane]:
+    """Spline coefficients of an image, by how often it was halved before.
+
+    The wide search through halved images does without the mask: specks would grow in it.
+    """
     camera = cameras[index]
-    grey = mono(images[camera.name])
+    image = images[camera.name]
+    grey = mono(image)
     if grey.shape != (camera.height, camera.width):
         raise CameraError(
             f"{camera.name}: the camera is {camera.width} x {camera.height} px, "
@@ -192,7 +203,8 @@ def _planes(
     for level in range(max(wanted) + 1):
         grey = halve(grey) if level else grey
         if level in wanted:
-            out[level] = spline_coefficients(grey)
+            mask = None if level else clipped(image)
+            out[level] = _Plane(spline_coefficients(grey), mask)
     return out
 
 
@@ -208,7 +220,7 @@ def _packaged(pair: StereoPair, crop: Rectification, result: DisparityMap) -> Pa
 
 def _search(
     small: Rectification,
-    coefficients: tuple[Floats32, Floats32],
+    planes: tuple[_Plane, _Plane],
     centre: Floats,
     settings: StereoSettings,
 ) -> _Found | None:
@@ -219,7 +231,7 @@ def _search(
     matching = replace(
         settings.matching, seed_px=4096, iterations=3, growth=1, fragment_px=40, edge_px=0
     )
-    views = (rectified(small, "left", coefficients[0]), rectified(small, "right", coefficients[1]))
+    views = (rectified(small, "left", *planes[0]), rectified(small, "right", *planes[1]))
     coarse = match_pair(*views, (far, near), matching).disparity
     known = np.isfinite(coarse)
     if known.sum() < _LEAST_FOUND:

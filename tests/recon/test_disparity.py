@@ -6,6 +6,7 @@ from scipy import ndimage
 
 from capture.errors import SettingsError
 from recon.disparity import DisparitySettings, Reason, match_pair, seed_disparity
+from recon.images import clipped
 from recon.rectify import Rectification, rectification, resample, spline_coefficients
 from tests.synthetic_stereo import draw, hit, ring
 
@@ -71,3 +72,26 @@ def test_settings_name_what_is_wrong():
         DisparitySettings(ncc_min=1.5)
     with pytest.raises(SettingsError, match="seed_block: expected an odd number, found 4"):
         DisparitySettings(seed_block=4)
+
+
+def test_a_highlight_that_moves_between_views_gives_no_disparity():
+    rng = np.random.default_rng(7)
+    skin = ndimage.gaussian_filter(rng.normal(size=(160, 260)), 1.2)
+    skin = (0.5 + 0.12 * skin / skin.std()).astype(np.float32).clip(0, 0.95)
+    left, right = skin[:, 20:220].copy(), skin[:, 26:226].copy()  # truth: 6 px
+    down, across = np.mgrid[:160, :200]
+    for view, column in ((left, 110), (right, 101)):  # where a surface 3 px nearer would be
+        view[np.hypot(across - column, down - 80) < 24] = 1.0
+    settings = DisparitySettings()
+
+    misled = match_pair(left, right, (0.0, 30.0), settings)
+    assert (np.abs(misled.disparity - 6.0) > 1.0).sum() > 200
+
+    drawn = [np.where(clipped(view), np.float32(np.inf), view) for view in (left, right)]
+    result = match_pair(*drawn, (0.0, 30.0), settings)
+    known = np.isfinite(result.disparity)
+    assert (np.abs(result.disparity - 6.0)[known] < 0.25).all()
+    assert not known[np.isinf(drawn[0])].any()
+    assert (result.reason[np.isinf(drawn[0])] == Reason.HIGHLIGHT).all()
+    away = (np.hypot(across - 110, down - 80) > 34) & (np.hypot(across - 107, down - 80) > 34)
+    assert known[away & (across > 15)].mean() > 0.95

@@ -96,3 +96,22 @@ def test_two_cameras_at_one_place_have_no_baseline():
     camera = ring()[0]
     with pytest.raises(CameraError, match="no baseline"):
         rectification(camera, camera, np.zeros(3), 100.0)
+
+
+def test_a_view_is_infinite_exactly_where_the_recorded_pixel_is_clipped():
+    cameras = ring()
+    geometry = rectification(cameras[0], cameras[1], np.zeros(3), 120.0)
+    rng = np.random.default_rng(8)
+    image = rng.uniform(0, 1, (cameras[0].height, cameras[0].width)).astype(np.float32)
+    mask = ndimage.binary_dilation(image > 0.999, iterations=3)
+    coefficients = spline_coefficients(image)
+    plain = rectified(geometry, "left", coefficients)
+    view = rectified(geometry, "left", coefficients, mask)
+    columns, rows = geometry.maps("left")
+    known = np.isfinite(plain)
+    literal = np.zeros_like(known)
+    literal[known] = mask[np.rint(rows[known]).astype(int), np.rint(columns[known]).astype(int)]
+    assert literal.sum() > 100
+    assert (np.isposinf(view) != literal).mean() < 1e-4  # to rounding
+    rest = ~np.isposinf(view)
+    np.testing.assert_array_equal(view[rest], plain[rest])

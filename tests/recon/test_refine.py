@@ -145,3 +145,11 @@ def test_the_same_views_give_the_same_bytes():
     a = Refiner(left, right).refine(start, radius=3, iterations=4, smoothness=5.0)
     b = Refiner(left, right).refine(start, radius=3, iterations=4, smoothness=5.0)
     assert a.disparity.tobytes() == b.disparity.tobytes()
+
+
+def test_gaps_are_bridged_straight_before_the_spline():
+    nan = np.nan
+    image = np.array([[nan, 1, 3, nan, nan, 6, nan], [nan] * 7], np.float32)
+    bridged = np.array([[1, 1, 3, 4, 5, 6, 6], [0] * 7], np.float32)
+    np.testing.assert_allclose(spline_rows(image), spline_rows(bridged), atol=1e-6)
+    assert np.isfinite(spline_rows(image)).all()

@@ -13,7 +13,7 @@ from recon.fusion import DepthView, FusionSettings, fuse
 from recon.rectify import Rectification, rectification
 from recon.scan import ReconSettings
 from tests.synthetic_stereo import ring
-from tools.bench.bench_fusion import alike, as_triangles
+from tools.bench.bench_fusion import alike, as_triangles, together
 from tools.bench.cost import measured
 from tools.bench.fusion_opponents import (
     ColmapSettings,
@@ -161,3 +161,7 @@ def test_cost_counts_processor_and_memory() -> None:
     assert value > 0
     assert 20 <= cost["own_mib"] <= 80
     assert 0 <= cost["cpu_s"] < 10
+    both = together(cost, {"wall_s": 1.0, "cpu_s": 2.0, "peak_mib": 1, "own_mib": 999})
+    assert both["cpu_s"] == pytest.approx(cost["cpu_s"] + 2.0)
+    assert both["own_mib"] == 999
+    assert both["peak_mib"] == cost["peak_mib"]

@@ -10,7 +10,8 @@ settings and with ours (three pixels, `agree_px` of depth), its points as they a
 same Poisson surface. `--score` names a script called with TAKE FRAME SCAN that prints one JSON
 line, such as score_scan.py; points are scored as a mesh of one tiny triangle each. One JSON line a
 way: seconds of wall clock and of processor, memory beyond what was held before, and the score; of a
-Poisson surface they are those of the surface alone. At the end the same as a Markdown table.
+Poisson surface the seconds are those of its points and its own, the memory is the more of both. At
+the end the same as a Markdown table.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +47,7 @@ from tools.bench.fusion_opponents import (
 
 _TINY_MM = 1e-3
 _TSDF_PAIRS = (1, 2, 3)
+_COARSE_VOXELS = 2.0  # of truncation, with voxels of the size of our Poisson cells
 _SCORES = (
     ("median mm", "median", 1.0, "{:.3f}"),
     ("rms mm", "rms", 1.0, "{:.3f}"),
@@ -112,30 +115,40 @@ def _run(
     points, cost = measured(lambda: fuse(views, settings.fusion(), workers=workers))
     report.add("ours, points", as_triangles(points), cost)
     for cell in cells:
-        scan, cost = measured(_poisson(points, cell))
-        report.add(f"ours, Poisson {cell:g} mm", scan, cost)
-    for pairs in _TSDF_PAIRS:
-        tsdf = TsdfSettings(voxel_px=settings.voxel_px, pairs=pairs)
-        scan, cost = measured(lambda chosen=tsdf: tsdf_scan(views, chosen))  # type: ignore[misc]
-        report.add(f"TSDF, {pairs} pairs at least", scan, cost)
-    spacing = settings.voxel_px * footprint_mm(views)
-    cell = settings.cell_spacings * spacing
-    for name, chosen in (("its", ColmapSettings()), ("our", alike(views, settings))):
-        theirs, cost = measured(_colmap(views, chosen, spacing, workers))
-        report.add(f"stereo_fusion, {name} settings, points", as_triangles(theirs), cost)
-        scan, cost = measured(_poisson(theirs, cell))
-        report.add(f"stereo_fusion, {name} settings, Poisson {cell:.1f} mm", scan, cost)
+        scan, more = measured(_poisson(points, cell))
+        report.add(f"ours, Poisson {cell:g} mm", scan, together(cost, more))
+    footprint = footprint_mm(views)
+    cell_px = settings.cell_spacings * settings.voxel_px
+    grids = [TsdfSettings(voxel_px=settings.voxel_px, pairs=pairs) for pairs in _TSDF_PAIRS]
+    grids.append(TsdfSettings(voxel_px=cell_px, truncation_voxels=_COARSE_VOXELS, pairs=2))
+    for grid in grids:
+        scan, cost = measured(partial(tsdf_scan, views, grid))
+        size = grid.voxel_px * footprint
+        report.add(f"TSDF, voxels {size:.1f} mm, seen by {grid.pairs} pairs", scan, cost)
+    spacing = settings.voxel_px * footprint
+    cell = cell_px * footprint
+    for whose, chosen in (("its", ColmapSettings()), ("our", alike(views, settings))):
+        fused = partial(colmap_fusion, views, chosen, spacing, workers=workers)
+        theirs, cost = measured(fused)
+        report.add(f"stereo_fusion, {whose} settings, points", as_triangles(theirs), cost)
+        scan, more = measured(_poisson(theirs, cell))
+        name = f"stereo_fusion, {whose} settings, Poisson {cell:.1f} mm"
+        report.add(name, scan, together(cost, more))
+
+
+def together(first: dict[str, float], second: dict[str, float]) -> dict[str, float]:
+    """The cost of two pieces of work, one after the other: seconds add up, memory does not."""
+    return {
+        key: round(first[key] + second[key], 2)
+        if key.endswith("_s")
+        else max(first[key], second[key])
+        for key in first
+    }
 
 
 def _poisson(points: Points, cell_mm: float) -> Callable[[], Scan]:
     settings = SurfaceSettings(cell_spacings=cell_mm / points.spacing_mm, depth_max=12)
     return lambda: poisson_scan(points, settings)
-
-
-def _colmap(
-    views: Sequence[DepthView], settings: ColmapSettings, spacing_mm: float, workers: int
-) -> Callable[[], Points]:
-    return lambda: colmap_fusion(views, settings, spacing_mm, workers=workers)
 
 
 def as_triangles(points: Points) -> Scan:

@@ -20,9 +20,7 @@ def measured(work: Callable[[], _Value]) -> tuple[_Value, dict[str, float]]:
         `own_mib`, the part of that peak that was not held before. Memory is Linux's count.
     """
     gc.collect()
-    ctypes.CDLL(None).malloc_trim(
-        0
-    )  # what was freed goes back, or the work would seem to need none
+    ctypes.CDLL(None).malloc_trim(0)  # what was freed goes back: nobody works in it unseen
     before = _memory_mib("VmRSS")
     Path("/proc/self/clear_refs").write_text("5", encoding="ascii")  # the peak starts here
     wall, processor = time.perf_counter(), time.process_time()

@@ -45,7 +45,7 @@ class TsdfSettings:
     """
 
     voxel_px: float = 1.6
-    truncation_voxels: float = 4.0
+    truncation_voxels: float = 3.0
     pairs: int = 1
 
 

@@ -21,6 +21,7 @@ _REASONS = {
     "UNCERTAIN": ("too uncertain", "#e69f00"),
     "LEFT_RIGHT": ("hidden from the other view", "#56b4e9"),
     "FRAGMENT": ("patch too small", "#cc79a7"),
+    "HIGHLIGHT": ("highlight, at white", "#f0e442"),
     "EDGE": ("at an edge", "#8c6d1f"),
 }
 _OTHER = "#7b3294"

@@ -22,6 +22,8 @@ from tests.synthetic_stereo import draw, ring
 from tests.tools import report_cases as cases
 from tools.cli import main
 from tools.report.charts import Labels
+from tools.report.inputs import scan_page
+from tools.report.report import report_for_take
 from tools.report.scan import write_scan_report
 from tools.report.scan_charts import coverage_matrix, reason_bars, stacked_chart
 from tools.verbs.recon import read_prior
@@ -129,6 +131,41 @@ def test_warnings_stand_at_the_top_once_with_their_frames(take: Take, tmp_path: 
     assert "Frame 3:" in top
     for words in warnings:
         assert words in top
+
+
+def test_the_report_of_the_take_tells_what_its_scans_warn_of(take: Take, tmp_path: Path):
+    blurred, lost = "left: {} % less fine detail", "right: no image of this frame"
+    scanned(
+        take,
+        {
+            0: told(0),
+            1: told(1, warnings=[blurred.format(31)]),
+            2: told(2, warnings=[lost, blurred.format(32)]),
+        },
+    )
+    out = tmp_path / "pages" / "take.html"
+    out.parent.mkdir()
+
+    def page() -> tuple[_Page, str]:
+        text = report_for_take(take.folder, out).read_text(encoding="utf-8")
+        return _Page(text), html.unescape(re.sub(r"<[^>]*>", " ", text))
+
+    parsed, words = page()
+    assert parsed.outside == []  # there is no page of the scans yet
+    assert "2 kinds of warnings in 2 of 3 frames, most in frame 2" in words
+    assert "first of all: left: 31 % less fine detail" in words
+    assert words.index("first of all") < words.index("Most in frame 2: 2.")
+    assert re.search(r"left: 31 % less fine detail\s+2\s+1\s", words)
+    assert re.search(r"no image of this frame\s+1\s+2\s", words)
+    assert "the scans warn" in words
+
+    write_scan_report(take, [0, 1, 2], scan_page(take))
+    (link,) = page()[0].outside
+    assert (out.parent / link).resolve() == scan_page(take).resolve()
+
+    scanned(take, {0: told(0)})
+    assert "kinds of warnings" not in page()[1]
+    assert "the scans warn" not in page()[1]
 
 
 def test_of_many_frames_some_are_shown_and_all_are_told(take: Take, tmp_path: Path):

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from capture.arrays import Floats
 from capture.camera import CameraArray
@@ -117,6 +119,7 @@ class ReportInputs:
         template: template.npz, to show its shapes beside the actor's.
         timings: seconds by stage, in the order run.
         settings: by stage, whatever settings are worth printing.
+        out: the page to be written, from which links start; without it there are none.
     """
 
     title: str
@@ -128,6 +131,14 @@ class ReportInputs:
     template: Path | None = None
     timings: Mapping[str, float] = field(default_factory=dict)
     settings: Mapping[str, Any] = field(default_factory=dict)
+    out: Path | None = None
+
+    def address(self, page: Path) -> str:
+        """Where another page is, seen from `out`; empty when it is not there."""
+        if self.out is None or not page.is_file():
+            return ""
+        steps = os.path.relpath(page.resolve(), self.out.resolve().parent)
+        return quote(Path(steps).as_posix())
 
     @cached_property
     def array(self) -> CameraArray | None:
@@ -167,6 +178,11 @@ class ReportInputs:
     def artist(self) -> Template | None:
         """The template the rig was made from, or None."""
         return None if self.template is None else read_template(self.template)
+
+
+def scan_page(take: Take) -> Path:
+    """Where the page of a take's scans is, if `likeness recon` has made them."""
+    return take.products / "recon" / "report.html"
 
 
 def json_object(path: Path) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -103,6 +104,7 @@ def write_scan_page(take: Path, out: Path) -> Path:
 
 
 def _write(inputs: ReportInputs, out: Path, parts: tuple[_Part, ...], progress: Progress) -> Path:
+    inputs = replace(inputs, out=Path(out))
     sections = []
     for done, part in enumerate(parts, start=1):
         sections += part(inputs)

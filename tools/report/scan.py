@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +18,7 @@ from tools.report.inputs import json_object
 from tools.report.page import Section, Verdict, facts, figure, folded, table, write_page
 from tools.report.scan_charts import coverage_matrix, reason_bars
 from tools.report.scan_pictures import depth_thumbnails, scan_pictures
+from tools.report.scan_remarks import gathered, warnings_told
 from tools.report.svg import escape, number
 
 _SHOWN = 6  # frames with pictures
@@ -60,7 +60,7 @@ class _Frame:
     @property
     def warnings(self) -> list[str]:
         """Sentences; none when the scan is older than they are."""
-        return [str(words) for words in self.told.get("warnings", [])]
+        return warnings_told(self.told)
 
     def surface(self) -> Scan:
         """The mesh, or the points when there is none."""
@@ -120,16 +120,10 @@ def _found(take: Take, frame: int) -> _Frame | None:
 
 def _gathered(frames: Sequence[_Frame]) -> list[str]:
     """Warnings of all frames; those alike but for their numbers are one, with the frames named."""
-    alike: dict[str, list[tuple[int, str]]] = {}
-    for entry in frames:
-        for words in entry.warnings:
-            device, _, sentence = words.partition(": ")
-            key = f"{device}: {re.sub(r'[0-9.]+', '#', sentence)}"
-            alike.setdefault(key, []).append((entry.frame, words))
-    order = sorted(alike.values(), key=len, reverse=True)
+    remarks = gathered({entry.frame: entry.warnings for entry in frames})
     if len(frames) == 1:
-        return [told[0][1] for told in order]
-    return [f"{told[0][1]} ({_frames_in_words([frame for frame, _ in told])})" for told in order]
+        return [remark.words for remark in remarks]
+    return [f"{remark.words} ({_frames_in_words(remark.frames)})" for remark in remarks]
 
 
 def _frames_in_words(frames: Sequence[int]) -> str:

@@ -12,7 +12,7 @@ from capture.camera import Camera, CameraArray
 from recon.mesh import Mesh
 from recon.surface import Scan, read_ply
 from tools.report.charts import colour_scale
-from tools.report.inputs import ReportInputs, ScanFile, TakeInputs
+from tools.report.inputs import ReportInputs, ScanFile, TakeInputs, scan_page
 from tools.report.page import (
     Section,
     Verdict,
@@ -24,6 +24,7 @@ from tools.report.page import (
     wipe,
 )
 from tools.report.picture import Pixels, displayable, jpeg_tag, sequential, stops, warm
+from tools.report.scan_remarks import remarks_table, remarks_verdict, warnings_told
 from tools.report.shade import Studio, cropped, enlarged, studio_camera
 from tools.report.svg import escape, number
 from track.performance import Performance
@@ -50,6 +51,9 @@ def scan_section(inputs: ReportInputs) -> list[Section]:
     parts: list[str] = []
     verdicts: list[Verdict] = []
     for item in inputs.takes:
+        warnings = {scan.frame: warnings_told(scan.report) for scan in item.scans}
+        parts.append(remarks_table(warnings, inputs.address(scan_page(item.take))))
+        verdicts += remarks_verdict(item.take.name, warnings)
         for scan in _spread(item.scans, max(1, min(3, _SCANS // len(inputs.takes)))):
             surface = read_ply(scan.path)
             parts.append(f"<h3>{escape(item.take.name)}, frame {scan.frame}</h3>")
@@ -62,7 +66,7 @@ def scan_section(inputs: ReportInputs) -> list[Section]:
                 verdicts.append(_scan_verdict(item.take.name, scan.frame, errors[scan.frame]))
             else:
                 verdicts += _agreement_verdict(item.take.name, scan)
-    if not parts:
+    if not any(parts):
         return []
     return [Section(anchor="scans", title="Scans", body="".join(parts), verdicts=tuple(verdicts))]
 

@@ -21,6 +21,7 @@ from capture.take import Take
 from recon.mesh import Mesh, read_obj
 from recon.prior import PriorMeshes
 from recon.scan import ReconSettings, reconstruct
+from tools.report.inputs import scan_page
 from tools.report.scan import write_scan_report
 from tools.verbs.options import Options, parse_frames
 from track.performance import read_performance
@@ -50,7 +51,7 @@ def run(arguments: Arguments, progress: Progress) -> dict[str, Any]:
     take = Take.open(arguments.take)
     frames = parse_frames(arguments.frames, take.frames)
     prior = None if arguments.prior is None else read_prior(arguments.prior)
-    page = take.products / "recon" / "report.html"
+    page = scan_page(take)
     try:
         scans = reconstruct(take, frames, arguments.settings, prior=prior, progress=progress)
     except SolveError:

@@ -10,7 +10,6 @@ with x_cam = R x_world + t, OpenCV axes, pixel centres at integers.
 
 from __future__ import annotations
 
-import difflib
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -21,7 +20,7 @@ import numpy as np
 from capture.camera import Camera, CameraArray
 from capture.documents import read_json
 from capture.errors import CameraError, LikenessError, raise_all
-from capture.names import is_plain_name
+from capture.names import is_plain_name, known_hint
 from capture.pose import Pose
 from capture.product import replacing
 
@@ -163,7 +162,5 @@ def _key_problems(
     problems = [f"{what}: missing key {key!r}" for key in required if key not in found]
     for key in found:
         if key not in known:
-            near = difflib.get_close_matches(str(key), known, n=1)
-            hint = f"; did you mean {near[0]!r}?" if near else f"; known: {', '.join(known)}"
-            problems.append(f"{what}: unknown key {key!r}{hint}")
+            problems.append(f"{what}: unknown key {key!r}; {known_hint(key, known)}")
     return problems

@@ -1,6 +1,9 @@
-"""Names that become file names: devices, slates, takes."""
+"""Names: which are safe as file names (devices, slates, takes), and which a wrong one meant."""
 
 from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
 
 _LONGEST = 64
 
@@ -13,3 +16,10 @@ def is_plain_name(name: object) -> bool:
         and not name.startswith(".")
         and all(c.isalnum() or c in "-_." for c in name)
     )
+
+
+def known_hint(name: object, known: Iterable[str]) -> str:
+    """What to say to a name that is not known: the nearest known one, or else all of them."""
+    names = list(known)
+    near = difflib.get_close_matches(str(name), names, n=1)
+    return f"did you mean {near[0]!r}?" if near else f"known: {', '.join(names)}"

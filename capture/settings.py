@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import types
 import typing
 from collections.abc import Mapping
@@ -12,6 +11,7 @@ from typing import Any
 
 from capture.documents import read_toml
 from capture.errors import SettingsError, raise_all
+from capture.names import known_hint
 
 
 def read_settings(path: Path, stages: Mapping[str, type[Any]]) -> dict[str, Any]:
@@ -136,9 +136,7 @@ def _is_union(hint: Any) -> bool:
 
 
 def _unknown(key: str, known: Mapping[str, Any], label: str) -> str:
-    near = difflib.get_close_matches(key, list(known), n=1)
-    hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(known)}"
-    return f"{label}: unknown; {hint}"
+    return f"{label}: unknown; {known_hint(key, known)}"
 
 
 def _toml(value: Any) -> str:

@@ -19,7 +19,6 @@ camera axes.
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -32,6 +31,7 @@ import numpy as np
 from capture.arrays import Floats
 from capture.documents import read_toml
 from capture.errors import SettingsError, raise_all
+from capture.names import known_hint
 
 _LEAST_SQUARES = 3
 _DICTIONARY = "DICT_"
@@ -110,8 +110,7 @@ class Board:
     def _dictionary_problems(self) -> list[str]:
         known = _dictionaries()
         if self.dictionary not in known:
-            near = difflib.get_close_matches(self.dictionary.upper(), known, n=1)
-            hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(known)}"
+            hint = known_hint(self.dictionary.upper(), known)
             return [f"dictionary: no marker dictionary is called {self.dictionary!r}; {hint}"]
         have = len(cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary)).bytesList)
         need = self.squares_x * self.squares_y // 2
@@ -174,13 +173,9 @@ def _typed(name: str, kind: str, value: Any) -> Any:
 
 
 def _unknown(found: Mapping[str, Any], known: tuple[str, ...], what: str) -> list[str]:
-    problems = []
-    for key in found:
-        if key not in known:
-            near = difflib.get_close_matches(key, known, n=1)
-            hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(known)}"
-            problems.append(f"unknown {what} {key!r}; {hint}")
-    return problems
+    return [
+        f"unknown {what} {key!r}; {known_hint(key, known)}" for key in found if key not in known
+    ]
 
 
 def _dictionaries() -> list[str]:

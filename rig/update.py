@@ -228,7 +228,7 @@ def solve_iterative(system: UpdateSystem, start: Floats, priors: UpdatePriors) -
     residual = system.right - product
     goal = priors.tolerance * np.maximum(np.sqrt((system.right**2).sum(axis=0)), 1e-300)
     step = np.empty_like(residual)
-    run_ranges(_precondition, count, system.starts, system.block_starts, inverse, residual, step)
+    run_ranges(_multiply_blocks, count, system.starts, system.block_starts, inverse, residual, step)
     direction = step.copy()
     energy = (residual * step).sum(axis=0)
     for _ in range(priors.iterations):
@@ -240,7 +240,7 @@ def solve_iterative(system: UpdateSystem, start: Floats, priors: UpdatePriors) -
         solved += length * direction
         residual -= length * product
         run_ranges(
-            _precondition, count, system.starts, system.block_starts, inverse, residual, step
+            _multiply_blocks, count, system.starts, system.block_starts, inverse, residual, step
         )
         renewed = (residual * step).sum(axis=0)
         direction *= np.where(energy > 0.0, renewed / np.where(energy > 0.0, energy, 1.0), 0.0)
@@ -309,28 +309,10 @@ def _invert(
 
 
 @numba.njit(cache=True, nogil=True)
-def _precondition(
-    begin: int, end: int, starts: Any, block_starts: Any, inverse: Any, x: Any, out: Any
+def _multiply_blocks(
+    begin: int, end: int, starts: Any, block_starts: Any, blocks: Any, x: Any, out: Any
 ) -> None:
-    for v in range(begin, end):
-        first = starts[v]
-        n = starts[v + 1] - first
-        base = block_starts[v]
-        for i in range(n):
-            sx, sy, sz = 0.0, 0.0, 0.0
-            for j in range(n):
-                value = inverse[base + i * n + j]
-                sx += value * x[first + j, 0]
-                sy += value * x[first + j, 1]
-                sz += value * x[first + j, 2]
-            out[first + i, 0], out[first + i, 1], out[first + i, 2] = sx, sy, sz
-
-
-@numba.njit(cache=True, nogil=True)
-def _multiply(
-    begin: int, end: int, starts: Any, columns: Any, block_starts: Any, blocks: Any,
-    position: Any, indptr: Any, indices: Any, data: Any, x: Any, out: Any,
-) -> None:  # fmt: skip
+    """Multiply the coordinates of each vertex's shapes by the vertex's own block."""
     for v in range(begin, end):
         first = starts[v]
         n = starts[v + 1] - first
@@ -342,11 +324,24 @@ def _multiply(
                 sx += value * x[first + j, 0]
                 sy += value * x[first + j, 1]
                 sz += value * x[first + j, 2]
-            k = columns[first + i]
+            out[first + i, 0], out[first + i, 1], out[first + i, 2] = sx, sy, sz
+
+
+@numba.njit(cache=True, nogil=True)
+def _multiply(
+    begin: int, end: int, starts: Any, columns: Any, block_starts: Any, blocks: Any,
+    position: Any, indptr: Any, indices: Any, data: Any, x: Any, out: Any,
+) -> None:  # fmt: skip
+    """The same, and what the Laplacian couples each shape of a vertex to at its neighbours."""
+    _multiply_blocks(begin, end, starts, block_starts, blocks, x, out)
+    for v in range(begin, end):
+        for own in range(starts[v], starts[v + 1]):
+            sx, sy, sz = out[own, 0], out[own, 1], out[own, 2]
+            k = columns[own]
             for e in range(indptr[v], indptr[v + 1]):
                 at = position[indices[e], k]
                 if at >= 0:
                     sx += data[e] * x[at, 0]
                     sy += data[e] * x[at, 1]
                     sz += data[e] * x[at, 2]
-            out[first + i, 0], out[first + i, 1], out[first + i, 2] = sx, sy, sz
+            out[own, 0], out[own, 1], out[own, 2] = sx, sy, sz

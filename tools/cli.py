@@ -5,7 +5,6 @@ Exit status: 0 done, 2 bad usage or bad input, 1 failure of the work itself, 130
 
 from __future__ import annotations
 
-import difflib
 import importlib
 import json
 import math
@@ -19,6 +18,7 @@ from types import ModuleType
 from typing import Any
 
 from capture.errors import InputError, LikenessError
+from capture.names import known_hint
 from capture.product import code_version
 from capture.settings import read_settings
 from tools.progress_bar import ProgressBar
@@ -69,9 +69,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     verb, rest = words[0], words[1:]
     if verb not in VERBS:
-        near = difflib.get_close_matches(verb, VERBS, n=1)
-        hint = f"did you mean {near[0]!r}?" if near else f"the verbs are {', '.join(VERBS)}"
-        print(f"likeness: no verb {verb!r}; {hint}", file=sys.stderr)
+        print(f"likeness: no verb {verb!r}; {known_hint(verb, VERBS)}", file=sys.stderr)
         return 2
     return _run(verb, rest)
 

@@ -21,11 +21,11 @@ from recon.visiting import import_take
 from tests.synthetic_stereo import draw, ring
 from tests.tools import report_cases as cases
 from tools.cli import main
-from tools.report.charts import Labels
+from tools.report.charts import Labels, stacked_chart
 from tools.report.inputs import scan_page
 from tools.report.report import report_for_take
 from tools.report.scan import write_scan_report
-from tools.report.scan_charts import coverage_matrix, reason_bars, stacked_chart
+from tools.report.scan_charts import coverage_matrix, reason_bars
 from tools.verbs.recon import read_prior
 
 CAMERA = {

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +23,7 @@ from tools.report.svg import (
 )
 
 _WIDTH = 720.0
+_BAR = 15.0  # thickness
 _IMAGER = 160.0  # width of a small picture of an imager
 
 
@@ -122,17 +123,15 @@ def bar_chart(
         marks: a second value of each bar, drawn as a tick across it; NaN draws none.
     """
     step, top = 21.0, 22.0 if limit else 8.0
-    left = 20.0 + 7.2 * max((len(name) for name in names), default=4)
+    left, parts = _named_rows(names, top, step, _BAR)
     finite = [v for v in [*values, *marks, *([limit[0]] if limit else [])] if math.isfinite(v)]
     x = Axis(low=0.0, high=max(finite, default=1.0) or 1.0, start=left, end=_WIDTH - 70.0)
-    parts = []
-    for row, (name, value) in enumerate(zip(names, values, strict=True)):
+    for row, (_, value) in enumerate(zip(names, values, strict=True)):
         y = top + step * row
         colour = LEVELS[levels[row]] if levels else PALETTE[0]
-        parts.append(text(left - 8, y + 12, name, class_="tick", text_anchor="end"))
         if math.isfinite(value):
             width = max(0.0, x(value) - left)
-            parts.append(element("rect", x=left, y=y, width=width, height=15.0, fill=colour))
+            parts.append(element("rect", x=left, y=y, width=width, height=_BAR, fill=colour))
         end = max(v for v in (value, 0.0) if math.isfinite(v))
         if marks and math.isfinite(marks[row]):
             at = x(marks[row])
@@ -147,6 +146,44 @@ def bar_chart(
     middle = (left + x.end) / 2
     parts.append(text(middle, bottom + 16, labels.x, class_="label", text_anchor="middle"))
     return drawing(_WIDTH, bottom + 26, "".join(parts), labels.title)
+
+
+def stacked_chart(
+    names: Sequence[str],
+    values: Sequence[Sequence[float]],
+    colours: Mapping[str, str],
+    labels: Labels,
+) -> str:
+    """Bars of one length, cut into shares.
+
+    Args:
+        names: one a bar.
+        values: for each bar, a size for each colour.
+        colours: by the word of the legend, in the order of the values.
+        labels: words; `x` names the measure.
+    """
+    step, top = 21.0, 8.0
+    left, parts = _named_rows(names, top, step, _BAR)
+    wide = _WIDTH - 70.0 - left
+    for row, (name, sizes) in enumerate(zip(names, values, strict=True)):
+        y = top + step * row
+        total = float(np.sum(sizes))
+        x = left
+        for (word, colour), size in zip(colours.items(), sizes, strict=True):
+            if total <= 0 or size <= 0:
+                continue
+            width = wide * size / total
+            told = element("title", f"{name}: {word} {100 * size / total:.0f} %")
+            bar = element("rect", x=x, y=y, width=width, height=_BAR, fill=colour)
+            parts.append(element("g", told + bar))
+            x += width
+        if total > 0:
+            first = f"{100 * sizes[0] / total:.0f} %" if len(sizes) else ""
+            parts.append(text(left + wide + 6, y + 12, first, class_="tick"))
+    bottom = top + step * len(names)
+    parts.append(text(left + wide / 2, bottom + 14, labels.x, class_="label", text_anchor="middle"))
+    legend, lines = _legend(list(colours), bottom + 36, list(colours.values()))
+    return drawing(_WIDTH, bottom + 32 + 20 * lines, "".join(parts) + legend, labels.title)
 
 
 def matrix_chart(
@@ -164,13 +201,11 @@ def matrix_chart(
         labels: words; `x` names the columns.
     """
     count = max((len(row) for row in cells), default=1)
-    left = 20.0 + 7.2 * max((len(name) for name in rows), default=4)
+    step, top = 15.0, 8.0
+    left, parts = _named_rows(rows, top, step, step - 2)
     x = Axis(low=0.0, high=float(count), start=left, end=_WIDTH - 14.0, label=labels.x, whole=True)
-    step = 15.0
-    parts = []
-    for index, (name, words) in enumerate(zip(rows, cells, strict=True)):
-        y = 8.0 + step * index
-        parts.append(text(left - 8, y + 11, name, class_="tick", text_anchor="end"))
+    for index, (_, words) in enumerate(zip(rows, cells, strict=True)):
+        y = top + step * index
         first = 0
         for column in range(1, len(words) + 1):
             if column < len(words) and words[column] == words[first]:
@@ -181,7 +216,7 @@ def matrix_chart(
                 element("rect", x=x(first), y=y, width=width, height=step - 2, fill=colour)
             )
             first = column
-    bottom = 8.0 + step * len(rows)
+    bottom = top + step * len(rows)
     for value in range(0, count, max(1, math.ceil(count / 10))):
         at = x(value + 0.5) if count <= 40 else x(value)
         parts.append(text(at, bottom + 14, value, class_="tick", text_anchor="middle"))
@@ -245,6 +280,18 @@ def _path(line: Series, x: Axis, y: Axis) -> str:
     if len(d) == 1:  # a single frame still leaves a dot
         d.append("h0.1")
     return "".join(d)
+
+
+def _named_rows(
+    names: Sequence[str], top: float, step: float, thickness: float
+) -> tuple[float, list[str]]:
+    """Where rows begin, px, and their names in front of that."""
+    left = 20.0 + 7.2 * max((len(name) for name in names), default=4)
+    parts = []
+    for row, name in enumerate(names):
+        y = top + step * row + 0.5 * thickness + 4.5
+        parts.append(text(left - 8, y, name, class_="tick", text_anchor="end"))
+    return left, parts
 
 
 def _legend(

@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
-
-from tools.report.charts import Labels
+from tools.report.charts import Labels, stacked_chart
 from tools.report.picture import stops
 from tools.report.svg import LEVELS, drawing, element, number, text
 
@@ -107,51 +105,3 @@ def reason_bars(
     return stacked_chart(
         names, values, dict(words), Labels(title="what became of the pixels", x="share of pixels")
     )
-
-
-def stacked_chart(
-    names: Sequence[str],
-    values: Sequence[Sequence[float]],
-    colours: Mapping[str, str],
-    labels: Labels,
-) -> str:
-    """Bars of one length, cut into shares.
-
-    Args:
-        names: one a bar.
-        values: for each bar, a size for each colour.
-        colours: by the word of the legend, in the order of the values.
-        labels: words; `x` names the measure.
-    """
-    step, top = 21.0, 8.0
-    left = 20.0 + 7.2 * max((len(name) for name in names), default=4)
-    wide = _WIDTH - 70.0 - left
-    parts = []
-    for row, (name, sizes) in enumerate(zip(names, values, strict=True)):
-        y = top + step * row
-        parts.append(text(left - 8, y + 12, name, class_="tick", text_anchor="end"))
-        total = float(np.sum(sizes))
-        x = left
-        for (word, colour), size in zip(colours.items(), sizes, strict=True):
-            if total <= 0 or size <= 0:
-                continue
-            width = wide * size / total
-            told = element("title", f"{name}: {word} {100 * size / total:.0f} %")
-            bar = element("rect", x=x, y=y, width=width, height=15.0, fill=colour)
-            parts.append(element("g", told + bar))
-            x += width
-        if total > 0:
-            first = f"{100 * sizes[0] / total:.0f} %" if len(sizes) else ""
-            parts.append(text(left + wide + 6, y + 12, first, class_="tick"))
-    bottom = top + step * len(names)
-    parts.append(text(left + wide / 2, bottom + 14, labels.x, class_="label", text_anchor="middle"))
-    place, line = left, 0
-    for word, colour in colours.items():
-        length = 34.0 + 6.6 * len(word)
-        if place + length > _WIDTH and place > left:
-            place, line = left, line + 1
-        y = bottom + 36 + 20 * line
-        parts.append(element("rect", x=place, y=y - 9, width=12, height=10, fill=colour))
-        parts.append(text(place + 17, y, word, class_="tick"))
-        place += length
-    return drawing(_WIDTH, bottom + 46 + 20 * line, "".join(parts), labels.title)

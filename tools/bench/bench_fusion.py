@@ -124,7 +124,7 @@ def _run(
     for grid in grids:
         scan, cost = measured(partial(tsdf_scan, views, grid))
         size = grid.voxel_px * footprint
-        report.add(f"TSDF, voxels {size:.1f} mm, seen by {grid.pairs} pairs", scan, cost)
+        report.add(f"TSDF, voxels {size:.1f} mm, pairs >= {grid.pairs}", scan, cost)
     spacing = settings.voxel_px * footprint
     cell = cell_px * footprint
     for whose, chosen in (("its", ColmapSettings()), ("our", alike(views, settings))):

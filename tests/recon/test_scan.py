@@ -50,6 +50,20 @@ def test_the_ellipsoid_is_recovered(result):
     assert (error > 2.0).mean() < 0.005
 
 
+def test_highlights_are_counted_and_leave_the_scan_right(few, result):
+    assert result.report["reasons"]["HIGHLIGHT"] == 0
+    glossy = {}
+    for index, (name, image) in enumerate(few.items()):
+        glossy[name] = image.copy()
+        down, across = np.mgrid[: image.shape[0], : image.shape[1]]
+        glossy[name][np.hypot(across - 95 - 4 * index, down - 100) < 9] = 65535
+    found = reconstruct_images(ARRAY, glossy, SMALL)
+    assert found.report["reasons"]["HIGHLIGHT"] > 500
+    error = np.abs(distance(found.scan.vertices.astype(np.float64)))
+    assert np.percentile(error, 99) < 1.0  # mm
+    assert error.max() < 3.0
+
+
 def test_the_mesh_covers_what_the_middle_view_faces(result):
     camera = ARRAY[1]
     u, v = np.meshgrid(np.arange(50, 150, 5.0), np.arange(50, 150, 5.0))

@@ -46,12 +46,12 @@ class FusionSettings:
         passes: rounds of averaging over pairs.
     """
 
-    agree_px: float = 0.7
+    agree_px: float = 1.0
     agreeing: int = 2
     facing_min: float = 0.15
     lone_facing: float = 0.2
     lone_sigma_px: float = 0.2
-    lone_hidden: int = 2
+    lone_hidden: int = 4
     stride: int = 6
     voxel_px: float = 1.6
     passes: int = 1

@@ -83,7 +83,7 @@ class ReconSettings:
     iterations: int = 5
     smoothness: float = 20.0
     ncc_min: float = 0.5
-    agree_px: float = 0.7
+    agree_px: float = 1.0
     agreeing: int = 2
     voxel_px: float = 1.6
     cell_spacings: float = 2.2

@@ -18,6 +18,7 @@ from capture.errors import SolveError, TakeError
 from capture.product import replacing
 from capture.settings import check_ranges
 from recon.fusion import Points
+from recon.settle import settled
 
 _MARGIN = 1.1  # Poisson's cube over the extent of the points
 
@@ -50,6 +51,8 @@ class SurfaceSettings:
             holes.
         lone_spacings: the same where the nearest point is known to one pair alone: its rim may
             hang over.
+        settle_spacings: points so near draw a vertex to themselves, past what a cell can follow; 0
+            leaves the surface as the solver drew it.
         component_share: pieces with a smaller share of the largest one's triangles are dropped.
         threads: of the Poisson solver.
     """
@@ -57,15 +60,16 @@ class SurfaceSettings:
     cell_spacings: float = 2.2
     depth_max: int = 9
     evidence_spacings: float = 3.0
-    lone_spacings: float = 1.2
+    lone_spacings: float = 1.6
+    settle_spacings: float = 3.0
     component_share: float = 0.01
     threads: int = 1
 
     def __post_init__(self) -> None:
         check_ranges(
             "surface", self, cell_spacings=(0.5, 20.0), depth_max=(5, 12),
-            evidence_spacings=(1.0, 50.0), lone_spacings=(0.0, 50.0), component_share=(0.0, 1.0),
-            threads=(1, 256),
+            evidence_spacings=(1.0, 50.0), lone_spacings=(0.0, 50.0), settle_spacings=(0.0, 20.0),
+            component_share=(0.0, 1.0), threads=(1, 256),
         )  # fmt: skip
 
 
@@ -112,6 +116,9 @@ def _trim(points: Points, vertices: Floats, triangles: Ints32, settings: Surface
     used, compact = np.unique(kept, return_inverse=True)
     out = vertices[used].astype(np.float32)
     faces = compact.reshape(-1, 3).astype(np.int32)
+    if settings.settle_spacings > 0:
+        reach = settings.settle_spacings * points.spacing_mm
+        out = settled(out, _normals(out, faces), points.positions, points.normals, reach)
     confidence = points.confidence[np.minimum(nearest[used], len(points) - 1)]
     return Scan(out, faces, _normals(out, faces), confidence.astype(np.float32))
 

@@ -1,4 +1,4 @@
-"""Moving a mesh onto the oriented points that it was drawn through.
+"""A mesh against the oriented points that it was drawn through: moved onto them, and where it ends.
 
 A Poisson surface answers for whole cells: a fold narrower than one, such as the rim of a lid, comes
 out shallow by a tenth of a millimetre. The points know better, and all there is to do is a step
@@ -62,14 +62,50 @@ def settled(
     )  # fmt: skip
     if len(positions) == 0:
         return vertices.copy()
+    columns = _columns(positions, point_normals, reach_mm)
+    return _settle(vertices, normals, columns)  # type: ignore[no-any-return]
+
+
+def openness(
+    vertices: Floats32,
+    normals: Floats32,
+    positions: Floats32,
+    point_normals: Floats32,
+    reach_mm: float,
+) -> Floats32:
+    """How far vertices lie outside of the points about them: 0 in their midst, 1 far off a border.
+
+    That is the length of the mean direction, in the tangent plane, to all points within reach whose
+    normal is within 60 degrees of the vertex's; at a straight border it is 2 / pi.
+
+    Args:
+        vertices: (V, 3) mm.
+        normals: (V, 3) unit.
+        positions: (N, 3) mm.
+        point_normals: (N, 3) unit.
+        reach_mm: how far points are looked for.
+
+    Returns:
+        (V,) 0..1; 1 where there is no point.
+    """
+    check_shape(
+        vertices=(vertices, "V 3"), normals=(normals, "V 3"),
+        positions=(positions, "N 3"), point_normals=(point_normals, "N 3"),
+    )  # fmt: skip
+    if len(positions) == 0:
+        return np.ones(len(vertices), np.float32)
+    columns = _columns(positions, point_normals, reach_mm)
+    return _openness(vertices, normals, columns)  # type: ignore[no-any-return]
+
+
+def _columns(positions: Floats32, normals: Floats32, reach: float) -> _Columns:
     low = positions.min(axis=0).astype(np.float64)
-    cell = np.floor((positions[:, :2] - low[:2]) / reach_mm).astype(np.int64)
+    cell = np.floor((positions[:, :2] - low[:2]) / reach).astype(np.int64)
     size = cell.max(axis=0) + 1
     column = cell[:, 0] * size[1] + cell[:, 1]
     order = np.lexsort((positions[:, 2], column))
     starts = np.searchsorted(column[order], np.arange(size.prod() + 1))
-    columns = _Columns(positions[order], point_normals[order], starts, size, low, reach_mm)
-    return _settle(vertices, normals, columns)  # type: ignore[no-any-return]
+    return _Columns(positions[order], normals[order], starts, size, low, reach)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -131,3 +167,49 @@ def _add_point(
     total[1] += weight * (x * normal[0] + y * normal[1] + z * normal[2])
     for k in range(3):
         total[2 + k] += weight * normal[k]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _openness(
+    vertices: Floats32, normals: Floats32, columns: _Columns
+) -> Floats32:  # pragma: no cover - compiled
+    positions, lines, starts, size, low, reach = columns
+    out = np.ones(len(vertices), np.float32)
+    mean = np.empty(3)
+    for i in range(len(vertices)):
+        mean[:] = 0.0
+        count = 0
+        across = int(np.floor((vertices[i, 0] - low[0]) / reach))
+        down = int(np.floor((vertices[i, 1] - low[1]) / reach))
+        for a in range(max(across - 1, 0), min(across + 2, size[0])):
+            for b in range(max(down - 1, 0), min(down + 2, size[1])):
+                for n in range(starts[a * size[1] + b], starts[a * size[1] + b + 1]):
+                    count += _add_direction(
+                        vertices[i], normals[i], positions[n], lines[n], reach, mean
+                    )
+        if count > 0:
+            out[i] = np.sqrt(mean[0] ** 2 + mean[1] ** 2 + mean[2] ** 2) / count
+    return out
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _add_direction(
+    vertex: Floats32,
+    normal: Floats32,
+    position: Floats32,
+    line: Floats32,
+    reach: float,
+    mean: Floats,
+) -> int:  # pragma: no cover - compiled
+    """Add the direction to a point, along the tangent plane; how many were added."""
+    x, y, z = position[0] - vertex[0], position[1] - vertex[1], position[2] - vertex[2]
+    alike = line[0] * normal[0] + line[1] * normal[1] + line[2] * normal[2]
+    if x * x + y * y + z * z >= reach * reach or alike < _ALIKE:
+        return 0
+    height = x * normal[0] + y * normal[1] + z * normal[2]
+    x, y, z = x - height * normal[0], y - height * normal[1], z - height * normal[2]
+    length = np.sqrt(x * x + y * y + z * z) + 1e-9
+    mean[0] += x / length
+    mean[1] += y / length
+    mean[2] += z / length
+    return 1

@@ -13,13 +13,14 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from capture.arrays import Bools, Floats, Floats32, Ints32, check_finite, check_shape
+from capture.arrays import Bools, Floats, Floats32, Ints, Ints32, check_finite, check_shape
 from capture.errors import SolveError, TakeError
 from capture.product import replacing
 from capture.settings import check_ranges
 from recon.fusion import Points
-from recon.settle import settled
+from recon.settle import openness, settled
 
+_SURROUNDED = 0.66  # openness below which a vertex lies in a gap; at a straight border it is 0.64
 _MARGIN = 1.1  # Poisson's cube over the extent of the points
 
 
@@ -51,6 +52,8 @@ class SurfaceSettings:
             holes.
         lone_spacings: the same where the nearest point is known to one pair alone: its rim may
             hang over.
+        bridge_spacings: vertices up to this far from the points stay all the same where points
+            surround them: a gap is bridged, a border does not hang over.
         settle_spacings: points so near draw a vertex to themselves, past what a cell can follow; 0
             leaves the surface as the solver drew it.
         component_share: pieces with a smaller share of the largest one's triangles are dropped.
@@ -60,7 +63,8 @@ class SurfaceSettings:
     cell_spacings: float = 2.2
     depth_max: int = 9
     evidence_spacings: float = 3.0
-    lone_spacings: float = 1.6
+    lone_spacings: float = 1.2
+    bridge_spacings: float = 3.5
     settle_spacings: float = 3.0
     component_share: float = 0.01
     threads: int = 1
@@ -68,7 +72,8 @@ class SurfaceSettings:
     def __post_init__(self) -> None:
         check_ranges(
             "surface", self, cell_spacings=(0.5, 20.0), depth_max=(5, 12),
-            evidence_spacings=(1.0, 50.0), lone_spacings=(0.0, 50.0), settle_spacings=(0.0, 20.0),
+            evidence_spacings=(1.0, 50.0), lone_spacings=(0.0, 50.0), bridge_spacings=(0.0, 50.0),
+            settle_spacings=(0.0, 20.0),
             component_share=(0.0, 1.0), threads=(1, 256),
         )  # fmt: skip
 
@@ -102,12 +107,8 @@ def poisson_scan(points: Points, settings: SurfaceSettings) -> Scan:
 
 def _trim(points: Points, vertices: Floats, triangles: Ints32, settings: SurfaceSettings) -> Scan:
     """Cut away what no point supports, drop small pieces, and carry the confidence over."""
-    reach = settings.evidence_spacings * points.spacing_mm
-    tree = cKDTree(points.positions)
-    answer = tree.query(vertices, distance_upper_bound=reach)
-    distance, nearest = np.asarray(answer[0]), np.asarray(answer[1])
-    lone = np.append(points.support < 2, True)[nearest]
-    near = np.isfinite(distance) & ~(lone & (distance > settings.lone_spacings * points.spacing_mm))
+    distance, nearest = _nearest(points, vertices, settings)
+    near = _evident(points, vertices, triangles, distance, nearest, settings)
     kept = triangles[near[triangles].all(axis=1)]
     kept = kept[_large_pieces(kept, len(vertices), settings.component_share)]
     if len(kept) == 0:
@@ -121,6 +122,35 @@ def _trim(points: Points, vertices: Floats, triangles: Ints32, settings: Surface
         out = settled(out, _normals(out, faces), points.positions, points.normals, reach)
     confidence = points.confidence[np.minimum(nearest[used], len(points) - 1)]
     return Scan(out, faces, _normals(out, faces), confidence.astype(np.float32))
+
+
+def _nearest(points: Points, vertices: Floats, settings: SurfaceSettings) -> tuple[Floats, Ints]:
+    """Distance (V,) in spacings to the nearest point, infinite beyond reach, and which it is."""
+    reach = max(settings.evidence_spacings, settings.bridge_spacings) * points.spacing_mm
+    answer = cKDTree(points.positions).query(vertices, distance_upper_bound=reach)
+    return np.asarray(answer[0]) / points.spacing_mm, np.asarray(answer[1])
+
+
+def _evident(
+    points: Points,
+    vertices: Floats,
+    triangles: Ints32,
+    distance: Floats,
+    nearest: Ints,
+    settings: SurfaceSettings,
+) -> Bools:
+    """Which vertices (V,) stay: those near a point, and those of a narrow gap between points."""
+    lone = np.append(points.support < 2, True)[nearest]
+    reach = np.where(lone, settings.lone_spacings, settings.evidence_spacings)
+    near: Bools = distance <= reach
+    gap = np.flatnonzero(~near & (distance <= settings.bridge_spacings))
+    if len(gap):
+        places = vertices.astype(np.float32)
+        normals = _normals(places, triangles)
+        wide = settings.bridge_spacings * points.spacing_mm
+        open_ = openness(places[gap], normals[gap], points.positions, points.normals, wide)
+        near[gap[open_ < _SURROUNDED]] = True
+    return near
 
 
 def _welded(vertices: Floats32, triangles: Ints32) -> Ints32:

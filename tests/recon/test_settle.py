@@ -7,7 +7,7 @@ import pytest
 
 from capture.arrays import Floats32
 from capture.errors import ShapeError
-from recon.settle import settled
+from recon.settle import openness, settled
 
 
 def _sphere(rng: np.random.Generator, count: int, radius: float) -> tuple[Floats32, Floats32]:
@@ -82,3 +82,33 @@ def test_shapes_are_checked() -> None:
             np.zeros((2, 3), np.float32), np.zeros((3, 3), np.float32),
             np.zeros((4, 3), np.float32), np.zeros((4, 3), np.float32), 1.0,
         )  # fmt: skip
+
+
+def test_openness_is_none_in_the_midst_two_by_pi_at_a_border_and_one_outside() -> None:
+    rng = np.random.default_rng(7)
+    flat = np.concatenate([rng.uniform([-6, -6], [0, 6], (20000, 2)), np.zeros((20000, 1))], axis=1)
+    up = np.tile(np.float32([0, 0, 1]), (len(flat), 1))
+    places = np.float32([[-3, 0, 0.1], [0, 0, 0.0], [1.9, 0, 0.0], [5, 0, 0.0], [-3, 0, 0.0]])
+    normals = np.float32([[0, 0, 1]] * 4 + [[0, 0, -1]])
+    found = openness(places, normals, flat.astype(np.float32), up, 2.0)
+    assert found[0] < 0.05
+    assert abs(found[1] - 2 / np.pi) < 0.03
+    assert found[2] > 0.95
+    assert found[3] == found[4] == 1.0  # no point within reach; none that looks the same way
+
+
+def test_openness_agrees_with_the_literal_form() -> None:
+    rng = np.random.default_rng(11)
+    positions, lines = _sphere(rng, 3000, 10.0)
+    vertices, normals = _sphere(rng, 50, 10.1)
+    cut = positions[:, 0] < 5.0
+    positions, lines = positions[cut], lines[cut]
+    expected = []
+    for vertex, normal in zip(vertices.astype(float), normals.astype(float), strict=True):
+        away = positions - vertex
+        away = away[(np.linalg.norm(away, axis=1) < 2.0) & (lines @ normal >= 0.5)]
+        flat = away - (away @ normal)[:, None] * normal
+        units = flat / np.linalg.norm(flat, axis=1, keepdims=True)
+        expected.append(np.linalg.norm(units.mean(axis=0)) if len(units) else 1.0)
+    found = openness(vertices, normals, positions, lines, 2.0)
+    np.testing.assert_allclose(found, expected, atol=1e-5)

@@ -118,3 +118,18 @@ def test_a_scan_has_no_triangle_without_area():
     sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
     assert sides.min() > 0.0
     assert len(np.unique(scan.vertices, axis=0)) == len(scan.vertices)
+
+
+def test_a_narrow_gap_is_bridged_and_a_border_does_not_hang_over():
+    whole = sphere()
+    slit = np.abs(whole.positions[:, 0]) > 2.0
+    points = dataclasses.replace(
+        whole,
+        positions=whole.positions[slit], normals=whole.normals[slit],
+        confidence=whole.confidence[slit], support=np.ones(slit.sum(), np.int32),
+    )  # fmt: skip
+    bridged = poisson_scan(points, SurfaceSettings(lone_spacings=1.2))
+    cut = poisson_scan(points, SurfaceSettings(lone_spacings=1.2, bridge_spacings=0.0))
+    middle = np.stack([np.zeros(8), 20 * np.cos(np.arange(8)), 20 * np.sin(np.arange(8))], axis=1)
+    assert SurfaceQuery(bridged.vertices, bridged.triangles).closest_points(middle)[2].max() < 0.5
+    assert SurfaceQuery(cut.vertices, cut.triangles).closest_points(middle)[2].min() > 0.5

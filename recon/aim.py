@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from capture.arrays import Bools, Floats, Floats32, Ints
 from capture.camera import Camera, CameraArray
-from recon.fusion import DepthView, lift
+from recon.fusion import DepthView, lift_at
 from recon.images import bilinear
 from recon.rectify import Rectification
 from recon.stereo import PairDepth
@@ -200,12 +200,13 @@ def _sampled(views: Sequence[DepthView]) -> tuple[Floats, Floats]:
     """Points and normals (N, 3) spread over all views."""
     points, normals = [np.zeros((0, 3))], [np.zeros((0, 3))]
     for view in views:
-        stride = max(view.disparity.size * len(views) // (4 * _SAMPLES), 1)
-        where, direction, _ = lift(view, stride)
-        whole = np.flatnonzero(np.isfinite(direction).all(axis=1))
-        step = max(len(whole) * len(views) // _SAMPLES, 1)
-        points.append(where[whole[::step]].astype(np.float64))
-        normals.append(direction[whole[::step]].astype(np.float64))
+        known = np.flatnonzero(np.isfinite(view.disparity))
+        step = max(len(known) * len(views) // _SAMPLES, 1)
+        rows, columns = np.divmod(known[step // 2 :: step], view.disparity.shape[1])
+        where, direction, _ = lift_at(view, rows, columns)
+        whole = np.isfinite(direction).all(axis=1)
+        points.append(where[whole].astype(np.float64))
+        normals.append(direction[whole].astype(np.float64))
     return np.concatenate(points), np.concatenate(normals)
 
 

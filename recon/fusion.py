@@ -120,16 +120,30 @@ def lift(view: DepthView, stride: int = 1) -> tuple[Floats32, Floats32, Floats32
     return points, normals, sigma
 
 
+def lift_at(view: DepthView, rows: Ints, columns: Ints) -> tuple[Floats32, Floats32, Floats32]:
+    """World points (N, 3), mm, normals (N, 3) and cosines (N,) to the reference view, of pixels.
+
+    Args:
+        view: the depth view.
+        rows: (N,) of pixels whose disparity is known.
+        columns: (N,).
+
+    Returns:
+        As `lift`; normals and cosines are NaN where the neighbourhood is too ragged for a plane.
+    """
+    geometry = view.geometry
+    return lift_pixels(  # type: ignore[no-any-return]
+        view.disparity, rows, columns, _lens(geometry), geometry.rotation, geometry.left.centre
+    )
+
+
 def _lifted(view: DepthView, stride: int) -> tuple[Floats32, Floats32, Floats32, Floats32]:
     """As `lift`, with the cosine (N,) between the normal and the ray to the reference view."""
     known = np.isfinite(view.disparity)
     rows, columns = np.ogrid[: known.shape[0], : known.shape[1]]
     taken = known & (((rows + columns) % stride == 0) | rim(known))
     rows, columns = np.nonzero(taken)
-    geometry = view.geometry
-    points, normals, facing = lift_pixels(
-        view.disparity, rows, columns, _lens(geometry), geometry.rotation, geometry.left.centre
-    )
+    points, normals, facing = lift_at(view, rows, columns)
     return points, normals, view.sigma_px[rows, columns], facing
 
 

@@ -1,4 +1,4 @@
-"""Surfaces through Open3D, the only module that imports it: Poisson meshes, queries, PLY files."""
+"""Surfaces through Open3D, which no other stage imports: Poisson meshes, queries, PLY files."""
 
 from __future__ import annotations
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -36,6 +37,23 @@ class Observations:
             jacobian=(self.jacobian, "L 2 3"),
             information=(self.information, "L 3"),
         )
+
+
+def merged(parts: Sequence[Observations]) -> Observations:
+    """Observations of several views in one; none of none."""
+    if not parts:
+        return Observations(
+            sample=np.zeros(0, np.int32),
+            offset=np.zeros((0, 2)),
+            jacobian=np.zeros((0, 2, 3)),
+            information=np.zeros((0, 3)),
+        )
+    return Observations(
+        sample=np.concatenate([part.sample for part in parts]),
+        offset=np.concatenate([part.offset for part in parts]),
+        jacobian=np.concatenate([part.jacobian for part in parts]),
+        information=np.concatenate([part.information for part in parts]),
+    )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

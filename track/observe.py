@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numba
@@ -57,16 +56,6 @@ def observe(
         offset=offset[good],
         jacobian=level.camera.project_jacobian(points[which]),
         information=information[good],
-    )
-
-
-def merged(parts: Sequence[Observations]) -> Observations:
-    """The observations of all views in one."""
-    return Observations(
-        sample=np.concatenate([part.sample for part in parts]),
-        offset=np.concatenate([part.offset for part in parts]),
-        jacobian=np.concatenate([part.jacobian for part in parts]),
-        information=np.concatenate([part.information for part in parts]),
     )
 
 

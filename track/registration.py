@@ -24,8 +24,8 @@ from track.beyond import search_beyond
 from track.flow import ALIGNED, FlowMatches, better, refine_flow, search_flow
 from track.guide import GuidedView, guided_view
 from track.laplacian import Constraints, LaplacianDeformer, Stiffness
-from track.lift import Lifted, Observations, triangulate
-from track.observe import believable, merged, observe
+from track.lift import Lifted, Observations, merged, triangulate
+from track.observe import believable, observe
 from track.pyramid import camera_at_level, image_pyramid
 from track.raster import Rasterizer
 from track.reference import ReferenceLevel, facing_normals, reference_level, visible_samples

@@ -33,6 +33,7 @@ def read_archive(
     required: Sequence[str],
     optional: Sequence[str] = (),
     *,
+    gaps: Sequence[str] = (),
     largest_bytes: int = _LARGEST_BYTES,
 ) -> dict[str, NDArray[Any]]:
     """Read the named arrays of an `.npz`; other arrays in it are left alone.
@@ -43,6 +44,7 @@ def read_archive(
         path: the file.
         required: keys that must be there.
         optional: keys that are read when they are there.
+        gaps: keys in which NaN says that there is no number; in all others it is damage.
         largest_bytes: an array that claims more is refused before memory is asked for it.
 
     Raises:
@@ -66,8 +68,11 @@ def read_archive(
     except _DAMAGE as error:
         raise ShapeError(f"{path}: expected an .npz archive of arrays: {error}") from error
     for key, array in out.items():
-        if array.dtype.kind == "f" and not np.isfinite(array).all():
-            bad = int((~np.isfinite(array)).sum())
+        if array.dtype.kind != "f":
+            continue
+        good = ~np.isinf(array) if key in gaps else np.isfinite(array)
+        if not good.all():
+            bad = int((~good).sum())
             raise ShapeError(f"{path}: {key} holds {bad} numbers that are not finite")
     return out
 

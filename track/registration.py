@@ -21,6 +21,7 @@ from capture.camera import Camera
 from capture.errors import SettingsError, SolveError
 from recon.surface import Scan
 from track.beyond import search_beyond
+from track.evidence import FrameEvidence, ViewMatches, frame_evidence, view_matches
 from track.flow import ALIGNED, FlowMatches, better, refine_flow, search_flow
 from track.guide import GuidedView, guided_view
 from track.laplacian import Constraints, LaplacianDeformer, Stiffness
@@ -55,6 +56,7 @@ class FrameResult:
         correlation: mean NCC of the matches of the last step.
         residual_px: median distance between matches and the projected lifted points.
         views: mean number of views that agree on a sample.
+        evidence: what the last step measured, by vertex and by view.
     """
 
     vertices: Floats
@@ -63,9 +65,10 @@ class FrameResult:
     correlation: float
     residual_px: float
     views: float
+    evidence: FrameEvidence
 
     @classmethod
-    def lost(cls, vertices: Floats) -> FrameResult:
+    def lost(cls, vertices: Floats, views: int) -> FrameResult:
         """A frame that could not be measured: the prediction, with confidence 0."""
         blank = np.zeros(len(vertices))
         return cls(
@@ -75,6 +78,7 @@ class FrameResult:
             correlation=0.0,
             residual_px=0.0,
             views=0.0,
+            evidence=FrameEvidence.nothing(len(vertices), views),
         )
 
 
@@ -101,7 +105,7 @@ class Registrar:
         heights_mm: Floats | None = None,
     ) -> None:
         self._neutral, self._triangles = neutral, triangles
-        self._heights = heights_mm
+        self._heights, self._cameras = heights_mm, cameras
         self._options = options
         self._samples = sample_surface(neutral, triangles, options.spacing_mm)
         self._raster = Rasterizer(triangles, len(neutral))
@@ -218,10 +222,15 @@ class Registrar:
                 name: (depth, scale / 2**step.level) for name, (depth, scale) in occluders.items()
             }
             views = {name: pyramids[name][step.level] for name in usable}
-            lifted, score = self._measure(step, vertices, views, scaled, depth)
-            vertices, weights = self._solve(step, vertices, lifted)
+            lifted, matches = self._measure(step, vertices, views, scaled, depth)
+            before = vertices
+            vertices, weights, agreement = self._solve(step, vertices, lifted)
             agreed = lifted.views
-        return self._result(vertices, lifted, weights, score)
+        moved = self._samples.points(vertices) - self._samples.points(before)
+        told = frame_evidence(
+            self._samples, len(vertices), matches, list(self._cameras), lifted, (agreement, moved)
+        )
+        return self._result(vertices, lifted, weights, told)
 
     def _reference(self, camera: Camera, image: Floats32) -> list[ReferenceLevel]:
         skin = self._skin(self._neutral)
@@ -267,25 +276,24 @@ class Registrar:
         images: Mapping[str, Floats32],
         occluders: Mapping[str, tuple[Floats32, float]],
         depth: ScanDepth | None,
-    ) -> tuple[Lifted, float]:
+    ) -> tuple[Lifted, dict[str, ViewMatches]]:
         skin = self._skin(vertices)
         points = self._samples.points(skin)
 
-        def measure(name: str) -> tuple[Observations, Floats]:
+        def measure(name: str) -> ViewMatches:
             level = self._views[name][step.level]
             view = guided_view(level, self._triangles, skin, images[name], occluders.get(name))
             matches = self._match(step, level, view, images[name])
             believed = believable(matches, self._options.min_correlation, step.limit_px)
             seen = observe(level, view, matches, points, believed)
-            return seen, matches.correlation[believed]
+            return view_matches(level.samples, matches.correlation, seen)
 
-        measured = list(self._pool.map(measure, images))  # in the order of the views
-        every = np.concatenate([scores for _, scores in measured])
-        parts = [seen for seen, _ in measured]
+        measured = dict(zip(images, self._pool.map(measure, images), strict=True))
+        parts = [matches.observations for matches in measured.values()]
         if depth is not None:
             parts += self._depths(depth, dict(zip(images, parts, strict=True)), skin)
         lifted = triangulate(merged(parts), len(self._samples), step.scale_px, _PRIOR_MM)
-        return lifted, float(every.mean()) if len(every) else 0.0
+        return lifted, measured
 
     def _scan_depth(self, scan: Scan, vertices: Floats, agreed: Ints) -> ScanDepth:
         """The scan around samples that few views agreed on (N,), and any view can see."""
@@ -321,14 +329,15 @@ class Registrar:
             matches, search_beyond(level, view, image, lost, (step.search_px, step.iterations))
         )
 
-    def _solve(self, step: Step, vertices: Floats, lifted: Lifted) -> tuple[Floats, Floats]:
+    def _solve(self, step: Step, vertices: Floats, lifted: Lifted) -> tuple[Floats, Floats, Floats]:
         weights = lifted.information / (lifted.information + _typical(lifted.information))
         weights = np.where(lifted.views == 1, _SINGLE_VIEW, weights)
         floor_mm = step.scale_px * 2**step.level * self._mm_per_px
-        weights *= _agreement(self._neighbours, lifted.motion, weights, floor_mm)
+        agreement = _agreement(self._neighbours, lifted.motion, weights, floor_mm)
+        weights *= agreement
         used = np.flatnonzero(weights > 1e-4)
         if len(used) < 12:
-            return vertices, weights
+            return vertices, weights, agreement
         chosen = self._samples.select(used.astype(np.int32))
         targets = chosen.points(vertices) + lifted.motion[used]  # c = u - h n: Ma et al. 2.2
         constraints = Constraints(
@@ -340,10 +349,10 @@ class Registrar:
         solved = self._deformers[step.bending_mm].solve(
             constraints, start=vertices, rotation_iterations=self._options.rotation_iterations
         )
-        return solved, weights
+        return solved, weights, agreement
 
     def _result(
-        self, vertices: Floats, lifted: Lifted, weights: Floats, score: float
+        self, vertices: Floats, lifted: Lifted, weights: Floats, told: FrameEvidence
     ) -> FrameResult:
         agreed = lifted.views >= _AGREED
         residual = lifted.residual_px[agreed]
@@ -352,9 +361,10 @@ class Registrar:
             vertices=vertices,
             confidence=self._to_vertices(sure),
             samples=int(agreed.sum()),
-            correlation=score,
+            correlation=told.mean_correlation(),
             residual_px=float(np.median(residual)) if len(residual) else float("nan"),
             views=float(lifted.views[agreed].mean()) if agreed.any() else 0.0,
+            evidence=told,
         )
 
     def _to_vertices(self, values: Floats) -> Floats:

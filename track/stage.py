@@ -30,6 +30,7 @@ from capture.take import Take
 from recon.images import mono
 from recon.mesh import Mesh
 from recon.scan import load_scan
+from track.evidence import EVIDENCE_KEYS, FrameEvidence
 from track.head_motion import damped_motion, head_motion
 from track.landmark_file import Landmarks, read_landmarks
 from track.performance import Performance, read_performance, write_performance
@@ -160,6 +161,7 @@ class _Tracked:
     vertices: Floats32
     confidence: Floats32
     figures: Mapping[str, float]
+    evidence: FrameEvidence
 
 
 class _FrameShelf:
@@ -174,7 +176,8 @@ class _FrameShelf:
         if not is_current(path, self._records[frame]):
             return None
         try:
-            held = read_archive(path, required=("vertices", "confidence", "figures"))
+            keys = ("vertices", "confidence", "figures", *EVIDENCE_KEYS)
+            held = read_archive(path, required=keys, gaps=EVIDENCE_KEYS)
         except ShapeError:
             return None  # damaged: made again
         if held["vertices"].shape != (vertex_count, 3):
@@ -183,16 +186,15 @@ class _FrameShelf:
             vertices=held["vertices"],
             confidence=held["confidence"],
             figures=dict(zip(_FIGURES, held["figures"].tolist(), strict=True)),
+            evidence=FrameEvidence(**{key: held[key] for key in EVIDENCE_KEYS}),
         )
 
     def save(self, frame: int, tracked: _Tracked) -> None:
         """Store a frame, whole or not at all."""
         path = self._path(frame)
         figures = np.array([tracked.figures[name] for name in _FIGURES])
-        write_archive(
-            path,
-            {"vertices": tracked.vertices, "confidence": tracked.confidence, "figures": figures},
-        )
+        shape = {"vertices": tracked.vertices, "confidence": tracked.confidence}
+        write_archive(path, {**shape, "figures": figures, **tracked.evidence.arrays()})
         write_record(path, self._records[frame])
 
     def _path(self, frame: int) -> Path:
@@ -238,6 +240,7 @@ class _Work:
             vertices=self._neutral.vertices.astype(np.float32),
             confidence=confidence.astype(np.float32),
             figures=figures,
+            evidence=FrameEvidence.nothing(len(confidence), len(self._cameras)),
         )
 
     def follow(self, frame: int, before: list[_Tracked]) -> _Tracked:
@@ -246,7 +249,7 @@ class _Work:
         start = self._predict(before)
         images = self._images(frame)
         if len(images) < _MIN_VIEWS:
-            result = FrameResult.lost(start)
+            result = FrameResult.lost(start, len(self._cameras))
         else:
             registrar = self._made()
             sure = before[-1].confidence.astype(np.float64)
@@ -264,6 +267,7 @@ class _Work:
             vertices=result.vertices.astype(np.float32),
             confidence=result.confidence.astype(np.float32),
             figures=figures,
+            evidence=result.evidence,
         )
 
     def _predict(self, before: list[_Tracked]) -> Floats:

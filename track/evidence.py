@@ -1,0 +1,225 @@
+"""What the last round of a frame's registration measured: the evidence that its quality is told by.
+
+By vertex, what the samples around it found; by view, how many of its matches agreed with the
+others. The error model (`track.error_model`) turns it into millimetres.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from capture.arrays import Floats, Floats32, Ints32, check_shape
+from track.lift import Lifted, Observations
+from track.surface_samples import SurfaceSamples
+
+_AGREES_PX = 0.7  # a match no farther than this from the triangulated point agrees with it
+_VERTEX = (
+    "residual_px", "correlation", "views", "information", "agreement", "motion_mm", "misfit_mm",
+)  # fmt: skip
+_VIEW = (
+    "view_seen", "view_believed", "view_sum", "view_agreed", "view_correlation", "view_residual_px",
+)  # fmt: skip
+VERTEX_KEYS: tuple[str, ...] = _VERTEX
+EVIDENCE_KEYS: tuple[str, ...] = (*_VERTEX, *_VIEW, "view_offset_px")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FrameEvidence:
+    """Evidence of one frame: V vertices, C views of the take, all float32.
+
+    Attributes:
+        residual_px: (V,) distance of agreeing matches from the triangulated points; NaN: none.
+        correlation: (V,) mean NCC of believed matches; NaN where there is none.
+        views: (V,) how many agreed on the place.
+        information: (V,) mm^-2 of the triangulation; 0: none.
+        agreement: (V,) 0..1, how well the samples fit their neighbours' motions; 0: none.
+        motion_mm: (V,) what the last round still found to move: convergence. NaN: not measured.
+        misfit_mm: (V,) how far the solved mesh stayed from the triangulated points. NaN likewise.
+        view_seen: (C,) samples the view could have matched; 0 for a view without this frame.
+        view_believed: (C,) matches that correlated and were near enough.
+        view_sum: (C,) sum of the NCC of these.
+        view_agreed: (C,) matches that agreed with the other views.
+        view_correlation: (C,) mean NCC of all its matches, believed or not; NaN: no view.
+        view_residual_px: (C,) median distance of believed matches from the points; NaN: none.
+        view_offset_px: (C, 2) median of match minus point; NaN: none. A device that is late
+            shows all skin behind, so its offsets point one way, others' average out.
+    """
+
+    residual_px: Floats32
+    correlation: Floats32
+    views: Floats32
+    information: Floats32
+    agreement: Floats32
+    motion_mm: Floats32
+    misfit_mm: Floats32
+    view_seen: Floats32
+    view_believed: Floats32
+    view_sum: Floats32
+    view_agreed: Floats32
+    view_correlation: Floats32
+    view_residual_px: Floats32
+    view_offset_px: Floats32
+
+    def __post_init__(self) -> None:
+        check_shape(
+            **{key: (getattr(self, key), "V") for key in _VERTEX},
+            **{key: (getattr(self, key), "C") for key in _VIEW},
+            view_offset_px=(self.view_offset_px, "C 2"),
+        )
+
+    @classmethod
+    def nothing(cls, vertices: int, views: int) -> FrameEvidence:
+        """The evidence of a frame that nothing was measured in, or of the reference itself."""
+        gap, none = np.full(vertices, np.nan, np.float32), np.zeros(vertices, np.float32)
+        lone, zero = np.full(views, np.nan, np.float32), np.zeros(views, np.float32)
+        return cls(
+            residual_px=gap, correlation=gap, views=none, information=none, agreement=none,
+            motion_mm=gap, misfit_mm=gap, view_seen=zero, view_believed=zero,
+            view_sum=zero, view_agreed=zero, view_correlation=lone, view_residual_px=lone,
+            view_offset_px=np.full((views, 2), np.nan, np.float32),
+        )  # fmt: skip
+
+    def arrays(self) -> dict[str, Floats32]:
+        """The arrays by name, in the order of the attributes."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    def mean_correlation(self) -> float:
+        """Mean NCC of all believed matches of all views; 0 without any."""
+        return float(self.view_sum.sum() / max(float(self.view_believed.sum()), 1.0))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ViewMatches:
+    """One view's share of a round.
+
+    Attributes:
+        seen: how many samples it tried to match.
+        correlation: mean NCC over them; NaN of none.
+        observations: its believed matches.
+        believed: (L,) the NCC of each of these.
+    """
+
+    seen: int
+    correlation: float
+    observations: Observations
+    believed: Floats
+
+
+def view_matches(samples: Ints32, correlation: Floats, seen: Observations) -> ViewMatches:
+    """One view's matches: the NCC (M,) of the samples (M,) it sees, and what was believed of it."""
+    tried = correlation > -1.0
+    return ViewMatches(
+        seen=len(samples),
+        correlation=float(correlation[tried].mean()) if tried.any() else float("nan"),
+        observations=seen,
+        believed=correlation[np.searchsorted(samples, seen.sample)],
+    )
+
+
+def frame_evidence(
+    samples: SurfaceSamples,
+    vertex_count: int,
+    views: Mapping[str, ViewMatches],
+    names: Sequence[str],
+    lifted: Lifted,
+    solved: tuple[Floats, Floats],
+) -> FrameEvidence:
+    """Gather what one round measured, by vertex and by view.
+
+    Args:
+        samples: N points of the surface.
+        vertex_count: V.
+        views: matches of the views that had the frame, by name.
+        names: all views of the take, in its order.
+        lifted: the round's motions of the samples.
+        solved: (N,) agreement of each sample with its neighbours, 0..1, and (N, 3) how each was
+            moved by the solve, mm.
+    """
+    agreement, moved = solved
+    found = lifted.views > 0
+    count = len(samples)
+    total, times = np.zeros(count), np.zeros(count)
+    for matches in views.values():
+        total += np.bincount(matches.observations.sample, matches.believed, minlength=count)
+        times += np.bincount(matches.observations.sample, minlength=count)
+    correlation = np.divide(total, times, out=np.full(count, np.nan), where=times > 0)
+    length = np.linalg.norm(lifted.motion, axis=1)
+    misfit = np.linalg.norm(lifted.motion - moved, axis=1)
+    measured = {
+        "residual_px": lifted.residual_px,
+        "correlation": correlation,
+        "motion_mm": np.where(found, length, np.nan),
+        "misfit_mm": np.where(found, misfit, np.nan),
+    }
+    counted = {
+        "views": lifted.views.astype(np.float64),
+        "information": lifted.information,
+        "agreement": np.where(found, agreement, 0.0),
+    }
+    vertex = {key: _around(samples, value, vertex_count) for key, value in measured.items()}
+    vertex |= {
+        key: np.nan_to_num(_around(samples, value, vertex_count)) for key, value in counted.items()
+    }
+    return FrameEvidence(**vertex, **_by_view(views, names, lifted))
+
+
+def blended_evidence(one: FrameEvidence, other: FrameEvidence, share: Floats) -> FrameEvidence:
+    """Evidence of a frame whose mesh was put together from two solves.
+
+    Args:
+        one: of the first solve.
+        other: of the second.
+        share: (V,) 0..1 of the second in each vertex. Where one of them has no number, the other's
+            is taken; numbers of views are those of the solve with the larger share over all.
+    """
+    check_shape(share=(share, "V"), one=(one.views, "V"), other=(other.views, "V"))
+    mixed: dict[str, Floats32] = {}
+    for key in _VERTEX:
+        a, b = getattr(one, key), getattr(other, key)
+        both = (1.0 - share) * np.nan_to_num(a) + share * np.nan_to_num(b)
+        value = np.where(np.isnan(a), b, np.where(np.isnan(b), a, both))
+        mixed[key] = value.astype(np.float32)
+    main = other if float(share.mean()) > 0.5 else one
+    mixed |= {key: getattr(main, key) for key in (*_VIEW, "view_offset_px")}
+    return FrameEvidence(**mixed)
+
+
+def _around(samples: SurfaceSamples, values: Floats, count: int) -> Floats32:
+    """Mean (V,) of the samples' numbers (N,) around each vertex; NaN where there is none."""
+    known = np.isfinite(values)
+    corners = samples.corners[known].ravel()
+    share = samples.barycentric[known].ravel()
+    total = np.bincount(corners, share, minlength=count)
+    mixed = np.bincount(corners, share * np.repeat(values[known], 3), minlength=count)
+    mean = np.divide(mixed, total, out=np.full(count, np.nan), where=total > 1e-9)
+    rounded: Floats32 = mean.astype(np.float32)
+    return rounded
+
+
+def _by_view(
+    views: Mapping[str, ViewMatches], names: Sequence[str], lifted: Lifted
+) -> dict[str, Floats32]:
+    rows = {key: np.zeros(len(names), np.float32) for key in _VIEW[:4]}
+    rows |= {key: np.full(len(names), np.nan, np.float32) for key in _VIEW[4:]}
+    offset = np.full((len(names), 2), np.nan, np.float32)
+    for place, name in enumerate(names):
+        if name not in views:
+            continue
+        matches = views[name]
+        seen = matches.observations
+        rows["view_seen"][place] = matches.seen
+        rows["view_correlation"][place] = matches.correlation
+        rows["view_believed"][place] = len(seen.sample)
+        rows["view_sum"][place] = matches.believed.sum()
+        if len(seen.sample) == 0:
+            continue
+        motion = lifted.motion[seen.sample]
+        away = seen.offset - np.einsum("lij,lj->li", seen.jacobian, motion)
+        distance = np.linalg.norm(away, axis=1)
+        rows["view_agreed"][place] = (distance < _AGREES_PX).sum()
+        rows["view_residual_px"][place] = np.median(distance)
+        offset[place] = np.median(away, axis=0)
+    return {**rows, "view_offset_px": offset}

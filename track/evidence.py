@@ -12,12 +12,15 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from capture.arrays import Floats, Floats32, Ints32, check_shape
+from track.guide import GuidedView
 from track.lift import Lifted, Observations
+from track.reference import ReferenceLevel
 from track.surface_samples import SurfaceSamples
 
 _AGREES_PX = 0.7  # a match no farther than this from the triangulated point agrees with it
 _VERTEX = (
-    "residual_px", "correlation", "views", "information", "agreement", "motion_mm", "misfit_mm",
+    "residual_px", "correlation", "views", "views_open", "information", "agreement", "motion_mm",
+    "misfit_mm",
 )  # fmt: skip
 _VIEW = (
     "view_seen", "view_believed", "view_sum", "view_agreed", "view_correlation", "view_residual_px",
@@ -34,6 +37,8 @@ class FrameEvidence:
         residual_px: (V,) distance of agreeing matches from the triangulated points; NaN: none.
         correlation: (V,) mean NCC of believed matches; NaN where there is none.
         views: (V,) how many agreed on the place.
+        views_open: (V,) how many could have: what the mesh lets them see, here and in the
+            reference. Skin is seen where two or more can.
         information: (V,) mm^-2 of the triangulation; 0: none.
         agreement: (V,) 0..1, how well the samples fit their neighbours' motions; 0: none.
         motion_mm: (V,) what the last round still found to move: convergence. NaN: not measured.
@@ -51,6 +56,7 @@ class FrameEvidence:
     residual_px: Floats32
     correlation: Floats32
     views: Floats32
+    views_open: Floats32
     information: Floats32
     agreement: Floats32
     motion_mm: Floats32
@@ -76,8 +82,8 @@ class FrameEvidence:
         gap, none = np.full(vertices, np.nan, np.float32), np.zeros(vertices, np.float32)
         lone, zero = np.full(views, np.nan, np.float32), np.zeros(views, np.float32)
         return cls(
-            residual_px=gap, correlation=gap, views=none, information=none, agreement=none,
-            motion_mm=gap, misfit_mm=gap, view_seen=zero, view_believed=zero,
+            residual_px=gap, correlation=gap, views=none, views_open=none, information=none,
+            agreement=none, motion_mm=gap, misfit_mm=gap, view_seen=zero, view_believed=zero,
             view_sum=zero, view_agreed=zero, view_correlation=lone, view_residual_px=lone,
             view_offset_px=np.full((views, 2), np.nan, np.float32),
         )  # fmt: skip
@@ -96,26 +102,32 @@ class ViewMatches:
     """One view's share of a round.
 
     Attributes:
-        seen: how many samples it tried to match.
+        seen: (S,) samples that it sees in the reference and, by the mesh, in the frame.
         correlation: mean NCC over them; NaN of none.
         observations: its believed matches.
         believed: (L,) the NCC of each of these.
     """
 
-    seen: int
+    seen: Ints32
     correlation: float
     observations: Observations
     believed: Floats
 
 
-def view_matches(samples: Ints32, correlation: Floats, seen: Observations) -> ViewMatches:
-    """One view's matches: the NCC (M,) of the samples (M,) it sees, and what was believed of it."""
-    tried = correlation > -1.0
+def view_matches(
+    level: ReferenceLevel, view: GuidedView, correlation: Floats, believed: Observations
+) -> ViewMatches:
+    """One view's matches: the NCC (M,) of all its samples, and those of them that were believed."""
+    column, row = level.centres.T
+    height, width = view.solid.shape
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    shown = inside & (view.solid[np.where(inside, row, 0), np.where(inside, column, 0)] > 0)
+    tried = shown & (correlation > -1.0)
     return ViewMatches(
-        seen=len(samples),
+        seen=level.samples[shown],
         correlation=float(correlation[tried].mean()) if tried.any() else float("nan"),
-        observations=seen,
-        believed=correlation[np.searchsorted(samples, seen.sample)],
+        observations=believed,
+        believed=correlation[np.searchsorted(level.samples, believed.sample)],
     )
 
 
@@ -141,10 +153,11 @@ def frame_evidence(
     agreement, moved = solved
     found = lifted.views > 0
     count = len(samples)
-    total, times = np.zeros(count), np.zeros(count)
+    total, times, able = np.zeros(count), np.zeros(count), np.zeros(count)
     for matches in views.values():
         total += np.bincount(matches.observations.sample, matches.believed, minlength=count)
         times += np.bincount(matches.observations.sample, minlength=count)
+        able[matches.seen] += 1.0
     correlation = np.divide(total, times, out=np.full(count, np.nan), where=times > 0)
     length = np.linalg.norm(lifted.motion, axis=1)
     misfit = np.linalg.norm(lifted.motion - moved, axis=1)
@@ -156,6 +169,7 @@ def frame_evidence(
     }
     counted = {
         "views": lifted.views.astype(np.float64),
+        "views_open": able,
         "information": lifted.information,
         "agreement": np.where(found, agreement, 0.0),
     }
@@ -210,7 +224,7 @@ def _by_view(
             continue
         matches = views[name]
         seen = matches.observations
-        rows["view_seen"][place] = matches.seen
+        rows["view_seen"][place] = len(matches.seen)
         rows["view_correlation"][place] = matches.correlation
         rows["view_believed"][place] = len(seen.sample)
         rows["view_sum"][place] = matches.believed.sum()

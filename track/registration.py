@@ -286,7 +286,7 @@ class Registrar:
             matches = self._match(step, level, view, images[name])
             believed = believable(matches, self._options.min_correlation, step.limit_px)
             seen = observe(level, view, matches, points, believed)
-            return view_matches(level.samples, matches.correlation, seen)
+            return view_matches(level, view, matches.correlation, seen)
 
         measured = dict(zip(images, self._pool.map(measure, images), strict=True))
         parts = [matches.observations for matches in measured.values()]

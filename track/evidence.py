@@ -18,14 +18,12 @@ from track.reference import ReferenceLevel
 from track.surface_samples import SurfaceSamples
 
 _AGREES_PX = 0.7  # a match no farther than this from the triangulated point agrees with it
-_VERTEX = (
-    "residual_px", "correlation", "views", "views_open", "information", "agreement", "motion_mm",
-    "misfit_mm",
-)  # fmt: skip
-_VIEW = (
-    "view_seen", "view_believed", "view_sum", "view_agreed", "view_correlation", "view_residual_px",
-)  # fmt: skip
-VERTEX_KEYS: tuple[str, ...] = _VERTEX
+_MEASURED = ("residual_px", "reprojection_px", "correlation", "motion_mm", "misfit_mm")
+_COUNTED = ("views", "views_open", "information", "agreement")
+_VERTEX = (*_MEASURED, *_COUNTED)
+_TALLIES = ("view_seen", "view_believed", "view_sum", "view_agreed")
+_JUDGED = ("view_correlation", "view_residual_px")
+_VIEW = (*_TALLIES, *_JUDGED)
 EVIDENCE_KEYS: tuple[str, ...] = (*_VERTEX, *_VIEW, "view_offset_px")
 
 
@@ -35,6 +33,7 @@ class FrameEvidence:
 
     Attributes:
         residual_px: (V,) distance of agreeing matches from the triangulated points; NaN: none.
+        reprojection_px: (V,) distance of the same matches from the solved mesh; NaN: none.
         correlation: (V,) mean NCC of believed matches; NaN where there is none.
         views: (V,) how many agreed on the place.
         views_open: (V,) how many could have: what the mesh lets them see, here and in the
@@ -54,6 +53,7 @@ class FrameEvidence:
     """
 
     residual_px: Floats32
+    reprojection_px: Floats32
     correlation: Floats32
     views: Floats32
     views_open: Floats32
@@ -79,14 +79,11 @@ class FrameEvidence:
     @classmethod
     def nothing(cls, vertices: int, views: int) -> FrameEvidence:
         """The evidence of a frame that nothing was measured in, or of the reference itself."""
-        gap, none = np.full(vertices, np.nan, np.float32), np.zeros(vertices, np.float32)
-        lone, zero = np.full(views, np.nan, np.float32), np.zeros(views, np.float32)
-        return cls(
-            residual_px=gap, correlation=gap, views=none, views_open=none, information=none,
-            agreement=none, motion_mm=gap, misfit_mm=gap, view_seen=zero, view_believed=zero,
-            view_sum=zero, view_agreed=zero, view_correlation=lone, view_residual_px=lone,
-            view_offset_px=np.full((views, 2), np.nan, np.float32),
-        )  # fmt: skip
+        none, zero = np.zeros(vertices, np.float32), np.zeros(views, np.float32)
+        blank = dict.fromkeys(_COUNTED, none) | dict.fromkeys(_TALLIES, zero)
+        blank |= {key: np.full(vertices, np.nan, np.float32) for key in _MEASURED}
+        blank |= {key: np.full(views, np.nan, np.float32) for key in _JUDGED}
+        return cls(view_offset_px=np.full((views, 2), np.nan, np.float32), **blank)
 
     def arrays(self) -> dict[str, Floats32]:
         """The arrays by name, in the order of the attributes."""
@@ -153,16 +150,21 @@ def frame_evidence(
     agreement, moved = solved
     found = lifted.views > 0
     count = len(samples)
-    total, times, able = np.zeros(count), np.zeros(count), np.zeros(count)
+    total, times, able, away, near = np.zeros((5, count))
     for matches in views.values():
-        total += np.bincount(matches.observations.sample, matches.believed, minlength=count)
-        times += np.bincount(matches.observations.sample, minlength=count)
+        seen = matches.observations
+        total += np.bincount(seen.sample, matches.believed, minlength=count)
+        times += np.bincount(seen.sample, minlength=count)
         able[matches.seen] += 1.0
+        agrees = _distance(seen, lifted.motion) < _AGREES_PX
+        away += np.bincount(seen.sample, agrees * _distance(seen, moved), minlength=count)
+        near += np.bincount(seen.sample, agrees, minlength=count)
     correlation = np.divide(total, times, out=np.full(count, np.nan), where=times > 0)
     length = np.linalg.norm(lifted.motion, axis=1)
     misfit = np.linalg.norm(lifted.motion - moved, axis=1)
     measured = {
         "residual_px": lifted.residual_px,
+        "reprojection_px": np.divide(away, near, out=np.full(count, np.nan), where=near > 0),
         "correlation": correlation,
         "motion_mm": np.where(found, length, np.nan),
         "misfit_mm": np.where(found, misfit, np.nan),
@@ -213,11 +215,22 @@ def _around(samples: SurfaceSamples, values: Floats, count: int) -> Floats32:
     return rounded
 
 
+def _away(seen: Observations, motion: Floats) -> Floats:
+    """Where matches lie from their samples (L, 2) px, once these have moved by (N, 3) mm."""
+    away: Floats = seen.offset - np.einsum("lij,lj->li", seen.jacobian, motion[seen.sample])
+    return away
+
+
+def _distance(seen: Observations, motion: Floats) -> Floats:
+    distance: Floats = np.linalg.norm(_away(seen, motion), axis=1)
+    return distance
+
+
 def _by_view(
     views: Mapping[str, ViewMatches], names: Sequence[str], lifted: Lifted
 ) -> dict[str, Floats32]:
-    rows = {key: np.zeros(len(names), np.float32) for key in _VIEW[:4]}
-    rows |= {key: np.full(len(names), np.nan, np.float32) for key in _VIEW[4:]}
+    rows = {key: np.zeros(len(names), np.float32) for key in _TALLIES}
+    rows |= {key: np.full(len(names), np.nan, np.float32) for key in _JUDGED}
     offset = np.full((len(names), 2), np.nan, np.float32)
     for place, name in enumerate(names):
         if name not in views:
@@ -230,8 +243,7 @@ def _by_view(
         rows["view_sum"][place] = matches.believed.sum()
         if len(seen.sample) == 0:
             continue
-        motion = lifted.motion[seen.sample]
-        away = seen.offset - np.einsum("lij,lj->li", seen.jacobian, motion)
+        away = _away(seen, lifted.motion)
         distance = np.linalg.norm(away, axis=1)
         rows["view_agreed"][place] = (distance < _AGREES_PX).sum()
         rows["view_residual_px"][place] = np.median(distance)

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import os
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import moderngl
@@ -16,13 +19,14 @@ _OPTIONS: dict[str, Any] = {
     "libegl": "libEGL.so.1",
 }
 _contexts: dict[int, Any] = {}  # by process id: a context does not survive a fork
+_locks: dict[int, threading.Lock] = {}  # nor does a lock that another thread held
 
 
 def gl_context() -> Any:
     """The process's standalone OpenGL context, made on first use and then kept.
 
-    Two contexts in one thread clash (moderngl issue 652), so whatever draws asks here, and makes
-    the context current with `with gl_context() as context:` while it does.
+    Two contexts in one thread clash (moderngl issue 652), so whatever draws asks here. Work that
+    may be asked for by several threads takes `current_context` instead.
 
     Raises:
         WorkError: naming the system packages to install when EGL or OpenGL is missing.
@@ -39,3 +43,17 @@ def gl_context() -> Any:
         context.gc_mode = "context_gc"  # objects die in `context.gc()`, never in another thread
         _contexts[process] = context
     return _contexts[process]
+
+
+@contextmanager
+def current_context() -> Iterator[Any]:
+    """Hold the process's context, current in this thread and in no other, while within.
+
+    Threads take turns; what they dropped since is freed first. It does not nest.
+
+    Raises:
+        WorkError: as `gl_context`.
+    """
+    with _locks.setdefault(os.getpid(), threading.Lock()), gl_context() as context:
+        context.gc()
+        yield context

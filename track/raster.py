@@ -9,7 +9,6 @@ or a barycentric coordinate must never be a mixture.
 
 from __future__ import annotations
 
-import threading
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,10 +17,9 @@ import numpy as np
 from capture.arrays import Bools, Floats, Floats32, Ints32, check_shape
 from capture.camera import Camera
 from capture.errors import ShapeError
-from track.gpu_context import gl_context
+from track.gpu_context import current_context
 
 _NEAR_MM = 1.0
-_LOCK = threading.Lock()
 _VERTEX = """#version 330
 in vec4 clip; in vec4 moved;
 out vec3 weights; out float depth; out vec3 motion;
@@ -91,7 +89,7 @@ class Rasterizer:
         self._triangles = np.ascontiguousarray(triangles, dtype=np.int32)
         self._vertex_count = vertex_count
         self._frames: dict[tuple[int, int], Any] = {}
-        with _LOCK, gl_context() as context:
+        with current_context() as context:
             self._program = context.program(vertex_shader=_VERTEX, fragment_shader=_FRAGMENT)
             size = max(1, 48 * len(self._triangles))
             self._clip, self._moved = context.buffer(reserve=size), context.buffer(reserve=size)
@@ -158,8 +156,7 @@ class Rasterizer:
         self, camera: Camera, clip: Floats32, moved: Floats32 | None
     ) -> tuple[Ints32, Floats32, Floats32 | None]:
         height, width = camera.height, camera.width
-        with _LOCK, gl_context() as context:
-            context.gc()
+        with current_context() as context:
             if (width, height) not in self._frames:
                 self._frames[width, height] = _framebuffer(context, width, height)
             frame = self._frames[width, height]

@@ -44,7 +44,8 @@ _LIGHTS = np.array([[0.5, 0.6, 0.9], [-0.8, 0.1, 0.6], [0.0, -0.5, 0.9], [0.9, 0
 _POWERS = np.array([0.62, 0.35, 0.22, 0.2])
 _GLOSS, _SHARPNESS = 0.05, 18.0
 _Z = np.array([0.0, 0.0, 1.0])
-_CHUNK = 1 << 20  # samples shaded at once
+_CHUNK = 1 << 14  # samples shaded at once
+_REMAP_WIDTH = 256  # and texels looked up side by side
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,19 +171,23 @@ def studio(size: int, seed: int) -> CameraArray:
 
 
 def photographs(
-    head: Head, cameras: CameraArray, seed: int
+    head: Head, cameras: CameraArray, seed: int, frame: int = 0
 ) -> Iterator[tuple[str, NDArray[np.uint8]]]:
-    """The 8-bit picture (H, W) of each camera, by name: gains and noise of their own."""
+    """The 8-bit picture (H, W) of each camera, by name: its own gain, the frame's own noise."""
     lights = _LIGHTS + np.random.default_rng([seed, 2]).normal(0.0, 0.12, _LIGHTS.shape)
     lights /= np.linalg.norm(lights, axis=1, keepdims=True)
     fine = head
     for _ in range(_HALVINGS):
         fine = fine.halved()
     raster = Rasterizer(fine.triangles, len(fine.vertices))
+    attributes = _attributes(fine)
     for index, camera in enumerate(cameras):
         rng = np.random.default_rng([seed, 3, index])
-        light = _light(fine, raster, _enlarged(camera), lights)
-        yield camera.name, _exposed(light, rng)
+        gain = float(rng.normal(1.0, 0.03))
+        if frame > 0:
+            rng = np.random.default_rng([seed, 3, index, frame])
+        light = _light((fine, attributes), raster, _enlarged(camera), lights)
+        yield camera.name, _exposed(light, gain, rng)
 
 
 def write_take(out: Path, head: Head, cameras: CameraArray, seed: int) -> None:
@@ -245,69 +250,80 @@ def _enlarged(camera: Camera) -> Camera:
     )  # fmt: skip
 
 
-def _light(head: Head, raster: Rasterizer, camera: Camera, lights: Floats) -> Floats32:
-    """What falls on the sensor (H, W), 1 at full white."""
+def _light(
+    shown: tuple[Head, Floats32], raster: Rasterizer, camera: Camera, lights: Floats
+) -> Floats32:
+    """What falls on the sensor (H, W), 1 at full white, of a head and its vertices' attributes."""
+    head, attributes = shown
     seen = raster.render(camera, head.vertices)
-    along = head.tangents()
-    out = np.full(seen.triangle.shape, np.float32(_GROUND))
-    rows, columns = np.nonzero(seen.triangle >= 0)
-    for start in range(0, len(rows), _CHUNK):
-        at = (rows[start : start + _CHUNK], columns[start : start + _CHUNK])
-        corners = head.triangles[seen.triangle[at]]
-        weights = seen.barycentric[at]
-
-        def mixed(values: Floats, corners: Ints32 = corners, w: Floats32 = weights) -> Floats32:
-            picked = values.astype(np.float32)[corners]
-            return np.asarray(np.einsum("nk,nkx->nx", w, picked), dtype=np.float32)
-
-        uv = mixed(head.uv)
+    out = np.full(seen.triangle.size, np.float32(_GROUND))
+    covered = np.flatnonzero(seen.triangle.ravel() >= 0)
+    triangles, barycentric = seen.triangle.ravel(), seen.barycentric.reshape(-1, 3)
+    eye = camera.centre.astype(np.float32)[:, None]
+    for start in range(0, len(covered), _CHUNK):
+        at = covered[start : start + _CHUNK]
+        a, b, c = head.triangles[triangles[at]].T
+        wa, wb, wc = np.ascontiguousarray(barycentric[at].T)
+        mixed = wa * attributes[:, a] + wb * attributes[:, b] + wc * attributes[:, c]
+        uv, places, normals = mixed[:2], mixed[2:5], mixed[5:8]
         albedo = _texels(head.texture, uv)
-        normals = mixed(head.normals)
         for axis in range(2):
             slope = _texels(head.slopes[:, :, axis], uv)
-            normals += slope[:, None] * mixed(along[axis])
-        towards = camera.centre.astype(np.float32) - mixed(head.vertices)
-        out[at] = _shade(albedo, normals, towards, lights.astype(np.float32))
-    return out
+            normals = normals + slope * mixed[8 + 3 * axis : 11 + 3 * axis]
+        out[at] = _shade(albedo, normals, eye - places, lights.astype(np.float32))
+    return out.reshape(seen.triangle.shape)
+
+
+def _attributes(head: Head) -> Floats32:
+    """What is mixed over triangles, (14, V): uv, place, normal, the directions of u and of v."""
+    columns = [head.uv, head.vertices, head.normals, *head.tangents()]
+    return np.ascontiguousarray(np.concatenate(columns, axis=1).T, dtype=np.float32)
 
 
 def _texels(texture: Floats32, uv: Floats32) -> Floats32:
-    """Texture (N,) at uv (N, 2), bicubic."""
+    """Texture (N,) at uv (2, N), bicubic."""
     height, width = texture.shape
-    columns = (uv[:, 0] * width - 0.5).reshape(-1, 1)
-    rows = ((1.0 - uv[:, 1]) * height - 0.5).reshape(-1, 1)
-    values: Floats32 = np.empty(len(uv), np.float32)
-    step = 32000  # remap takes no longer side
-    for start in range(0, len(uv), step):
-        part = slice(start, start + step)
-        found = cv2.remap(
-            texture, columns[part], rows[part], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
-        )
-        values[part] = found[:, 0]
+    count = uv.shape[1]
+    rows = -(-count // _REMAP_WIDTH)  # remap is slow on narrow pictures
+    at = np.zeros((2, rows * _REMAP_WIDTH), np.float32)
+    at[:, :count] = uv[0] * width - 0.5, (1.0 - uv[1]) * height - 0.5
+    columns, lines = at.reshape(2, rows, _REMAP_WIDTH)
+    found = cv2.remap(texture, columns, lines, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    values: Floats32 = np.asarray(found, np.float32).reshape(-1)[:count]
     return values
 
 
 def _shade(albedo: Floats32, normals: Floats32, towards: Floats32, lights: Floats32) -> Floats32:
-    """Lambert with a little wrap, and a soft Blinn-Phong highlight; nothing casts a shadow."""
-    normal = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
-    eye = towards / np.linalg.norm(towards, axis=1, keepdims=True)
+    """Lambert with a little wrap, and a soft Blinn-Phong highlight; nothing casts a shadow.
+
+    Albedo (N,), normals and directions to the eye (3, N), lights (L, 3).
+    """
+    normal = normals / np.maximum(_length(normals), np.float32(1e-9))
+    eye = towards / _length(towards)
     total = np.float32(_AMBIENT) * albedo
     for light, power in zip(lights, _POWERS, strict=True):
-        total += albedo * np.float32(power) * np.maximum((normal @ light + 0.15) / 1.15, 0.0)
-        half = light + eye
-        half /= np.linalg.norm(half, axis=1, keepdims=True)
-        shine = np.maximum((normal * half).sum(axis=1), 0.0) ** np.float32(_SHARPNESS)
+        facing = (light @ normal + np.float32(0.15)) / np.float32(1.15)
+        total += albedo * np.float32(power) * np.maximum(facing, np.float32(0.0))
+        half = light[:, None] + eye
+        half /= _length(half)
+        x, y, z = normal * half
+        shine = np.maximum(x + y + z, np.float32(0.0)) ** np.float32(_SHARPNESS)
         total += np.float32(_GLOSS * power * _SHARPNESS / 16.0) * shine
-    return total.astype(np.float32)
+    return total
 
 
-def _exposed(light: Floats32, rng: np.random.Generator) -> NDArray[np.uint8]:
+def _length(vectors: Floats32) -> Floats32:
+    x, y, z = vectors
+    length: Floats32 = np.sqrt(x * x + y * y + z * z)
+    return length
+
+
+def _exposed(light: Floats32, gain: float, rng: np.random.Generator) -> NDArray[np.uint8]:
     """Blur, pixels' areas, vignette, gain, noise, 8 bits."""
     soft = cv2.GaussianBlur(light, (0, 0), _OVER * _PSF_PX)
     size = (light.shape[1] // _OVER, light.shape[0] // _OVER)
     pixels = cv2.resize(soft, size, interpolation=cv2.INTER_AREA).astype(np.float64)
     rows, columns = (np.linspace(-1.0, 1.0, count) ** 2 for count in pixels.shape)
-    gain = rng.normal(1.0, 0.03)
     signal = _WHITE_DN * gain * pixels * (1.0 - _VIGNETTE * (rows[:, None] + columns[None]))
     noise = rng.normal(size=signal.shape) * np.sqrt(_NOISE_DN**2 + _SHOT_DN * signal)
     return np.clip(np.rint(signal + noise), 0, 255).astype(np.uint8)

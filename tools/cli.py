@@ -30,6 +30,7 @@ VERBS: dict[str, str] = {
     "recon": "reconstruct the surface of frames by stereo",
     "neutral": "register a template mesh to the actor at the first frame",
     "track": "track the neutral mesh through a take",
+    "correct": "pin, draw, lock or leave out what tracking is to be told",
     "rig": "solve a personalised blendshape rig from performances",
     "export": "write a rig, a performance or weights in an exchange format",
     "report": "write the HTML report of a take",

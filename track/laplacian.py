@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,6 +45,16 @@ class Constraints:
         check_finite(barycentric=self.barycentric, targets=self.targets, weights=self.weights)
         if self.weights.size and float(self.weights.min()) < 0.0:
             raise ShapeError(f"weights: expected >= 0, found {float(self.weights.min()):g}")
+
+    @classmethod
+    def joined(cls, parts: Sequence[Constraints]) -> Constraints:
+        """Several sets, at least one, as one."""
+        return cls(
+            corners=np.concatenate([part.corners for part in parts]),
+            barycentric=np.concatenate([part.barycentric for part in parts]),
+            targets=np.concatenate([part.targets for part in parts]),
+            weights=np.concatenate([part.weights for part in parts]),
+        )
 
     def points(self, vertices: Floats) -> Floats:
         """Where the constrained points (N, 3) are on a surface with vertices (V, 3)."""

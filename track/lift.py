@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numba
@@ -37,6 +37,10 @@ class Observations:
             jacobian=(self.jacobian, "L 2 3"),
             information=(self.information, "L 3"),
         )
+
+    def at(self, share: float) -> Observations:
+        """The same at a share of their information."""
+        return replace(self, information=share * self.information)
 
 
 def merged(parts: Sequence[Observations]) -> Observations:

@@ -16,33 +16,28 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 
-from capture.arrays import Floats, Floats32, Ints, Ints32
+from capture.arrays import Floats, Floats32, Ints
 from capture.camera import Camera
 from capture.errors import SettingsError, SolveError
 from recon.surface import Scan
-from track.beyond import search_beyond
-from track.evidence import FrameEvidence, ViewMatches, frame_evidence, view_matches
-from track.flow import ALIGNED, FlowMatches, better, refine_flow, search_flow
-from track.guide import GuidedView, guided_view
+from track.evidence import FrameEvidence, frame_evidence
+from track.face_reference import FaceReference, ReferenceWindows, face_reference
+from track.guide import guided_view
 from track.laplacian import Constraints, LaplacianDeformer, Stiffness
-from track.lift import Lifted, Observations, merged, triangulate
-from track.observe import believable, observe
-from track.pyramid import camera_at_level, image_pyramid
-from track.raster import Rasterizer
-from track.reference import ReferenceLevel, facing_normals, reference_level, visible_samples
+from track.lift import Lifted
+from track.matching import Matcher, RoundImages
+from track.pyramid import image_pyramid
 from track.rigid import fit_similarity
-from track.scan_depth import ScanDepth, depth_observations
+from track.scan_depth import ScanDepth
 from track.schedule import Step
+from track.sightings import Sightings
 from track.start import blended_start, place_scores
-from track.surface_samples import SurfaceSamples, sample_surface, vertex_rings
+from track.surface_model import SurfaceModel
 
-_PRIOR_MM = 1.0
 _SURE = 0.25  # confidence from which a vertex carries its neighbours into the next frame
 _HELD = 0.8  # confidence from which skin is not looked for elsewhere in the next frame
 _SINGLE_VIEW = 0.02  # weight of a sample that one view alone sees, and no scan: of unknown depth
 _AGREED = 2  # witnesses, views or a view and the scan, that fix a sample's place
-_FEW = 2  # a sample that no more views than this see gets its depth from the scan too
-_RINGS = 3  # edges within which two triangles count as one piece of surface
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -86,52 +81,44 @@ class Registrar:
     """Registers frames of one take to its neutral.
 
     Args:
-        neutral: (V, 3) vertices at the reference frame, world mm.
-        triangles: (T, 3).
+        surface: what is tracked.
         cameras: of the views, by device name.
         images: the reference images, float32 mono, of the views that have one.
         options: see `track.stage.TrackSettings`.
-        heights_mm: (V,) how far the skin lies over the neutral, along its normals; None: on it.
-            What is matched is the skin, b + h n; what is solved for is the mesh, b.
     """
 
     def __init__(
         self,
-        neutral: Floats,
-        triangles: Ints32,
+        surface: SurfaceModel,
         cameras: Mapping[str, Camera],
         images: Mapping[str, Floats32],
         options: RegistrarOptions,
-        heights_mm: Floats | None = None,
     ) -> None:
-        self._neutral, self._triangles = neutral, triangles
-        self._heights, self._cameras = heights_mm, cameras
-        self._options = options
-        self._samples = sample_surface(neutral, triangles, options.spacing_mm)
-        self._raster = Rasterizer(triangles, len(neutral))
-        self._rings = vertex_rings(triangles, len(neutral), _RINGS)
-        self._levels = max(step.level for step in options.steps) + 1
-        self._pool = ThreadPoolExecutor(os.cpu_count() or 1)  # the kernels let go of the GIL
-        self._views = {name: self._reference(cameras[name], images[name]) for name in images}
-        seen = np.zeros(len(self._samples), np.int64)
-        for levels in self._views.values():
-            seen[levels[0].samples] += 1
-        self._seen = seen
-        self._mm_per_px = _pixel_size(cameras, neutral)
+        self._surface, self._cameras, self._options = surface, cameras, options
+        self._levels = options.windows.levels
+        self._pool = ThreadPoolExecutor(os.cpu_count() or 1)
+        self._mm_per_px = _pixel_size(cameras, surface.neutral)
         self._deformers = {
-            mm: LaplacianDeformer(neutral, triangles, Stiffness(bending_mm=mm))
+            mm: LaplacianDeformer(surface.neutral, surface.triangles, Stiffness(bending_mm=mm))
             for mm in sorted({step.bending_mm for step in options.steps})
         }
-        self._neighbours = _neighbour_matrix(self._samples, triangles, len(neutral))
+        self._neutral = self.reference(-1, surface.neutral, images)
+
+    def reference(
+        self, frame: int, vertices: Floats, images: Mapping[str, Floats32]
+    ) -> FaceReference:
+        """What a frame (-1 the neutral) showed, its mesh (V, 3) being known, to match others to."""
+        placed, windows = (frame, vertices), self._options.windows
+        return face_reference(self._surface, placed, self._cameras, images, windows, self._pool)
 
     @property
-    def views_of_samples(self) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
-        """How many reference views see each sample, (N,)."""
-        return self._seen
+    def views_of_samples(self) -> Ints:
+        """How many views of the neutral see each sample, (N,)."""
+        return self._neutral.seen
 
     def vertex_views(self) -> Floats:
         """Confidence (V,) of the reference itself: 1 where two views see the skin, 0 where none."""
-        return self._to_vertices(np.minimum(self._seen / 2.0, 1.0))
+        return self._surface.to_vertices(np.minimum(self._neutral.seen / 2.0, 1.0))
 
     def carried(self, vertices: Floats, confidence: Floats) -> Floats:
         """The mesh (V, 3) again from its confident vertices alone.
@@ -152,10 +139,11 @@ class Registrar:
             targets=vertices[sure],
             weights=np.ones(len(sure)),
         )
-        rigid = fit_similarity(self._neutral[sure], vertices[sure])
+        rest = self._surface.neutral
+        rigid = fit_similarity(rest[sure], vertices[sure])
         supple = min(self._deformers)
         return self._deformers[supple].solve(
-            constraints, start=rigid.apply(self._neutral), data_weight=10.0, rotation_iterations=3
+            constraints, start=rigid.apply(rest), data_weight=10.0, rotation_iterations=3
         )
 
     def best_start(
@@ -170,34 +158,36 @@ class Registrar:
             images: the frame's images, float32 mono.
 
         Returns:
-            (V, 3) world mm.
+            (V, 3) world mm; `starts[0]` itself when no other is better anywhere.
         """
         last = self._levels - 1
-        usable = [name for name in self._views if name in images]
+        views = self._neutral.views
+        usable = [name for name in views if name in images]
         coarse = {name: image_pyramid(images[name], self._levels)[last] for name in usable}
-        skins = [self._skin(start) for start in starts]
+        surface = self._surface
+        skins = [surface.skin(start) for start in starts]
 
         def score(name: str) -> Floats:
-            level = self._views[name][last]
-            seen = [guided_view(level, self._triangles, skin, coarse[name]) for skin in skins]
-            return place_scores(level, seen, len(self._samples))
+            level = views[name][last]
+            seen = [guided_view(level, surface.triangles, skin, coarse[name]) for skin in skins]
+            return place_scores(level, seen, len(surface.samples))
 
         scores = np.stack(list(self._pool.map(score, usable)), axis=2)
-        sure = (confidence[self._samples.corners] * self._samples.barycentric).sum(axis=1) > _HELD
+        samples = surface.samples
+        sure = (confidence[samples.corners] * samples.barycentric).sum(axis=1) > _HELD
         scores[1:, sure] = np.nan
         supple = self._deformers[min(self._deformers)]
-        return blended_start(starts, scores, self._samples, self._neighbours, supple)
+        return blended_start(starts, scores, samples, surface.neighbours, supple)
 
     def register(
-        self, start: Floats, images: Mapping[str, Floats32], scan: Scan | None = None
+        self, start: Floats, images: Mapping[str, Floats32], aids: FrameAids | None = None
     ) -> FrameResult:
         """Find the mesh in a frame.
 
         Args:
             start: (V, 3) where to begin, world mm.
             images: the frame's images, float32 mono; views without a reference are not used.
-            scan: the frame's own, world mm, where there is one: it tells the depth of samples
-                that one or two views alone see.
+            aids: what else is known of the frame; None: nothing.
 
         Returns:
             The registered mesh and its figures.
@@ -205,149 +195,82 @@ class Registrar:
         Raises:
             SolveError: when no view of the frame has a reference.
         """
-        usable = [name for name in self._views if name in images]
+        known = aids if aids is not None else FrameAids()
+        usable = [name for name in self._neutral.views if name in images]
         if not usable:
             raise SolveError("no view of the frame has a reference image")
         pyramids = {name: image_pyramid(images[name], self._levels) for name in usable}
+        matcher = Matcher(
+            surface=self._surface,
+            references=(self._neutral, *known.references),
+            min_correlation=self._options.min_correlation,
+            pool=self._pool,
+        )
         vertices = start
         occluders: dict[str, tuple[Floats32, float]] = {}
         depth: ScanDepth | None = None
-        agreed = self._seen
+        agreed = self._neutral.seen
         for index, step in enumerate(self._options.steps):
             if index == 1:  # the first round has brought the mesh within the tolerance
                 occluders = {name: self._depth(name, vertices) for name in usable}
-            if scan is not None and depth is None and index > 0 and step.level == 0:
-                depth = self._scan_depth(scan, vertices, agreed)
-            scaled = {
-                name: (depth, scale / 2**step.level) for name, (depth, scale) in occluders.items()
-            }
-            views = {name: pyramids[name][step.level] for name in usable}
-            lifted, matches = self._measure(step, vertices, views, scaled, depth)
+            if known.scan is not None and depth is None and index > 0 and step.level == 0:
+                depth = matcher.scan_depth(known.scan, vertices, agreed)
+            seen = RoundImages(
+                views={name: pyramids[name][step.level] for name in usable},
+                occluders={
+                    name: (drawn, scale / 2**step.level)
+                    for name, (drawn, scale) in occluders.items()
+                },
+                depth=depth,
+                stride=self._options.search_stride if index == 0 else 1,
+            )
+            lifted, matches = matcher.measure(step, vertices, seen)
             before = vertices
-            vertices, weights, agreement = self._solve(step, vertices, lifted)
+            vertices, weights, agreement = self._solve(step, vertices, lifted, known.sightings)
             agreed = lifted.views
-        moved = self._samples.points(vertices) - self._samples.points(before)
+        samples = self._surface.samples
+        moved = samples.points(vertices) - samples.points(before)
         told = frame_evidence(
-            self._samples, len(vertices), matches, list(self._cameras), lifted, (agreement, moved)
+            samples, len(vertices), matches, list(self._cameras), lifted, (agreement, moved)
         )
         return self._result(vertices, lifted, weights, told)
-
-    def _reference(self, camera: Camera, image: Floats32) -> list[ReferenceLevel]:
-        skin = self._skin(self._neutral)
-        points = self._samples.points(skin)
-        lenses = [camera_at_level(camera, level) for level in range(self._levels)]
-        drawn = [self._raster.render(lens, skin) for lens in lenses]
-        normals = facing_normals(self._neutral, self._triangles)
-        chosen = visible_samples(
-            self._samples, skin, normals, camera, drawn[0], self._options.min_cosine
-        )
-        surface = (self._triangles, self._samples.triangle[chosen], self._rings)
-        fine, coarse = self._options.half_window, self._options.half_window_coarse
-
-        def build(level: int, picture: Floats32) -> ReferenceLevel:
-            pixels = lenses[level].project(points[chosen])
-            half = fine if level == 0 else coarse
-            return reference_level(
-                lenses[level], picture, drawn[level], pixels, chosen, surface, half
-            )
-
-        pyramid = image_pyramid(image, self._levels)
-        return list(self._pool.map(build, range(self._levels), pyramid))
 
     def _depth(self, name: str, vertices: Floats) -> tuple[Floats32, float]:
         """A coarse depth map of the mesh, and how many finest pixels one of its pixels spans."""
         level = min(1, self._levels - 1)
-        camera = self._views[name][level].camera
-        return self._raster.render(camera, self._skin(vertices)).depth, float(2**level)
+        camera = self._neutral.views[name][level].camera
+        surface = self._surface
+        return surface.raster.render(camera, surface.skin(vertices)).depth, float(2**level)
 
-    def _skin(self, vertices: Floats) -> Floats:
-        """The skin (V, 3) over a mesh: normal displacements ride on its own normals."""
-        if self._heights is None:
-            return vertices
-        lifted: Floats = vertices + self._heights[:, None] * facing_normals(
-            vertices, self._triangles
-        )
-        return lifted
-
-    def _measure(
-        self,
-        step: Step,
-        vertices: Floats,
-        images: Mapping[str, Floats32],
-        occluders: Mapping[str, tuple[Floats32, float]],
-        depth: ScanDepth | None,
-    ) -> tuple[Lifted, dict[str, ViewMatches]]:
-        skin = self._skin(vertices)
-        points = self._samples.points(skin)
-
-        def measure(name: str) -> ViewMatches:
-            level = self._views[name][step.level]
-            view = guided_view(level, self._triangles, skin, images[name], occluders.get(name))
-            matches = self._match(step, level, view, images[name])
-            believed = believable(matches, self._options.min_correlation, step.limit_px)
-            seen = observe(level, view, matches, points, believed)
-            return view_matches(level, view, matches.correlation, seen)
-
-        measured = dict(zip(images, self._pool.map(measure, images), strict=True))
-        parts = [matches.observations for matches in measured.values()]
-        if depth is not None:
-            parts += self._depths(depth, dict(zip(images, parts, strict=True)), skin)
-        lifted = triangulate(merged(parts), len(self._samples), step.scale_px, _PRIOR_MM)
-        return lifted, measured
-
-    def _scan_depth(self, scan: Scan, vertices: Floats, agreed: Ints) -> ScanDepth:
-        """The scan around samples that few views agreed on (N,), and any view can see."""
-        poor = (self._seen > 0) & (agreed <= _FEW)
-        return ScanDepth(scan, self._samples.points(self._skin(vertices))[poor])
-
-    def _depths(
-        self, depth: ScanDepth, seen: Mapping[str, Observations], skin: Floats
-    ) -> list[Observations]:
-        """What the scan adds to the matches of samples that few views see."""
-        times = np.zeros(len(self._samples), np.int64)
-        for part in seen.values():
-            times[part.sample] += 1
-        normals = self._samples.points(facing_normals(skin, self._triangles))
-        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-        estimate = (self._samples.points(skin), normals)
-        return [
-            depth_observations(
-                depth, self._views[name][0].camera, part, times[part.sample] <= _FEW, estimate
-            )
-            for name, part in seen.items()
-        ]
-
-    def _match(
-        self, step: Step, level: ReferenceLevel, view: GuidedView, image: Floats32
-    ) -> FlowMatches:
-        stride = self._options.search_stride if step is self._options.steps[0] else 1
-        chosen = level.samples % stride == 0
-        found = search_flow(level, view, chosen, step.search_px)
-        matches = refine_flow(level, view, found.displacement, step.iterations)
-        lost = chosen & level.at_edge & (matches.correlation < ALIGNED)
-        return better(
-            matches, search_beyond(level, view, image, lost, (step.search_px, step.iterations))
-        )
-
-    def _solve(self, step: Step, vertices: Floats, lifted: Lifted) -> tuple[Floats, Floats, Floats]:
+    def _solve(
+        self, step: Step, vertices: Floats, lifted: Lifted, sightings: Sequence[Sightings]
+    ) -> tuple[Floats, Floats, Floats]:
         weights = lifted.information / (lifted.information + _typical(lifted.information))
         weights = np.where(lifted.views == 1, _SINGLE_VIEW, weights)
         floor_mm = step.scale_px * 2**step.level * self._mm_per_px
-        agreement = _agreement(self._neighbours, lifted.motion, weights, floor_mm)
+        agreement = _agreement(self._surface.neighbours, lifted.motion, weights, floor_mm)
         weights *= agreement
         used = np.flatnonzero(weights > 1e-4)
         if len(used) < 12:
             return vertices, weights, agreement
-        chosen = self._samples.select(used.astype(np.int32))
+        chosen = self._surface.samples.select(used.astype(np.int32))
         targets = chosen.points(vertices) + lifted.motion[used]  # c = u - h n: Ma et al. 2.2
-        constraints = Constraints(
-            corners=chosen.corners,
-            barycentric=chosen.barycentric,
-            targets=targets,
-            weights=weights[used] / weights[used].mean(),
-        )
+        constraints = [
+            Constraints(
+                corners=chosen.corners,
+                barycentric=chosen.barycentric,
+                targets=targets,
+                weights=weights[used] / weights[used].mean(),
+            )
+        ]
+        skin = self._surface.skin(vertices)
+        for sighted in sightings:
+            if sighted.accuracy_px <= 2**step.level:
+                constraints.append(sighted.constraints(vertices, skin, self._cameras))
         solved = self._deformers[step.bending_mm].solve(
-            constraints, start=vertices, rotation_iterations=self._options.rotation_iterations
+            Constraints.joined(constraints),
+            start=vertices,
+            rotation_iterations=self._options.rotation_iterations,
         )
         return solved, weights, agreement
 
@@ -359,7 +282,7 @@ class Registrar:
         sure = np.clip(weights / max(_typical(weights), 1e-9), 0.0, 1.0)
         return FrameResult(
             vertices=vertices,
-            confidence=self._to_vertices(sure),
+            confidence=self._surface.to_vertices(sure),
             samples=int(agreed.sum()),
             correlation=told.mean_correlation(),
             residual_px=float(np.median(residual)) if len(residual) else float("nan"),
@@ -367,14 +290,20 @@ class Registrar:
             evidence=told,
         )
 
-    def _to_vertices(self, values: Floats) -> Floats:
-        """Mean (V,) of the samples' values (N,) around each vertex; 0 where there is none."""
-        corners, share = self._samples.corners.ravel(), self._samples.barycentric.ravel()
-        count = len(self._neutral)
-        total = np.bincount(corners, share, minlength=count)
-        mixed = np.bincount(corners, share * np.repeat(values, 3), minlength=count)
-        mean: Floats = np.divide(mixed, total, out=np.zeros(count), where=total > 0)
-        return mean
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FrameAids:
+    """What else is known of a frame than its images.
+
+    Attributes:
+        scan: its own, world mm: it tells the depth of samples that one or two views alone see.
+        references: other frames than the neutral, whose meshes are known, to match it to.
+        sightings: surface points whose pixels are known.
+    """
+
+    scan: Scan | None = None
+    references: tuple[FaceReference, ...] = ()
+    sightings: tuple[Sightings, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -383,20 +312,14 @@ class RegistrarOptions:
 
     Attributes:
         steps: the rounds, coarse to fine.
-        spacing_mm: distance between samples.
-        half_window: windows have 2 half + 1 px a side at the finest level.
-        half_window_coarse: the same at the other levels.
-        min_cosine: least cosine between normal and view.
+        windows: how references are cut.
         min_correlation: least NCC believed.
-        search_stride: every how manieth sample is searched by whole pixels.
+        search_stride: in the first round every how manieth sample is matched.
         rotation_iterations: updates of the local frames in each solve.
     """
 
     steps: tuple[Step, ...]
-    spacing_mm: float
-    half_window: int
-    half_window_coarse: int
-    min_cosine: float
+    windows: ReferenceWindows
     min_correlation: float
     search_stride: int
     rotation_iterations: int
@@ -404,20 +327,6 @@ class RegistrarOptions:
     def __post_init__(self) -> None:
         if not self.steps:
             raise SettingsError("steps: expected at least one")
-
-
-def _neighbour_matrix(
-    samples: SurfaceSamples, triangles: Ints32, vertex_count: int
-) -> sparse.csr_matrix:
-    """Which samples lie around the same vertices, (N, N) csr of ones without the diagonal."""
-    rows = np.arange(len(samples))
-    own = samples.corners[rows, samples.barycentric.argmax(axis=1)]
-    pick = sparse.csr_matrix((np.ones(len(rows)), (rows, own)), (len(rows), vertex_count))
-    near = pick @ vertex_rings(triangles, vertex_count, 1) @ pick.T
-    near.setdiag(0)
-    near.eliminate_zeros()
-    near.data[:] = 1.0
-    return sparse.csr_matrix(near)
 
 
 def _agreement(

@@ -13,6 +13,7 @@ import numpy as np
 
 from capture.arrays import Floats, Ints32, check_shape
 from capture.camera import Camera
+from track.laplacian import Constraints
 from track.lift import Lifted, Observations, merged, triangulate
 from track.surface_samples import SurfaceSamples
 
@@ -81,3 +82,21 @@ class Sightings:
                 )
             )
         return triangulate(merged(parts), len(self.surface), self.scale_px, _PRIOR_MM)
+
+    def constraints(
+        self, vertices: Floats, skin: Floats, cameras: Mapping[str, Camera]
+    ) -> Constraints:
+        """Where the points should go, of the mesh that lies under the skin (V, 3) they are on.
+
+        Args:
+            vertices: (V, 3) the mesh's estimate, world mm.
+            skin: (V, 3) the skin over it, which the views show.
+            cameras: the full-resolution cameras, by name.
+        """
+        lifted = self.lifted(skin, cameras)
+        return Constraints(
+            corners=self.surface.corners,
+            barycentric=self.surface.barycentric,
+            targets=self.surface.points(vertices) + lifted.motion,
+            weights=np.where(lifted.views > 0, self.weight, 0.0),
+        )

@@ -31,14 +31,16 @@ from recon.images import mono
 from recon.mesh import Mesh
 from recon.scan import load_scan
 from track.evidence import EVIDENCE_KEYS, FrameEvidence
+from track.face_reference import ReferenceWindows
 from track.head_motion import damped_motion, head_motion
 from track.landmark_file import Landmarks, read_landmarks
 from track.performance import Performance, read_performance, write_performance
 from track.pyramid import level_count
-from track.registration import FrameResult, Registrar, RegistrarOptions
+from track.registration import FrameAids, FrameResult, Registrar, RegistrarOptions
 from track.rigid import fit_similarity
 from track.schedule import schedule
 from track.skin import skin_heights
+from track.surface_model import SurfaceModel
 
 _FIGURES = ("samples", "correlation", "residual_px", "views", "seconds")
 _MIN_VIEWS = 2
@@ -255,7 +257,9 @@ class _Work:
             sure = before[-1].confidence.astype(np.float64)
             scan = load_scan(self._scans[frame]) if frame in self._scans else None
             starts = [registrar.carried(start, sure), *self._other_starts(start, before)]
-            result = registrar.register(registrar.best_start(starts, sure, images), images, scan)
+            result = registrar.register(
+                registrar.best_start(starts, sure, images), images, FrameAids(scan=scan)
+            )
         figures = {
             "samples": float(result.samples),
             "correlation": result.correlation,
@@ -303,14 +307,13 @@ class _Work:
                     f"{self._take.folder}: frame {first} has {len(images)} of "
                     f"{len(self._cameras)} views; the reference needs at least {_MIN_VIEWS}"
                 )
-            self._registrar = Registrar(
-                self._neutral.vertices,
-                self._neutral.triangles,
-                {camera.name: camera for camera in self._cameras},
-                images,
-                _options(self._settings, self._cameras, self._neutral),
-                self._heights(),
+            mesh = self._neutral
+            surface = SurfaceModel.of(
+                mesh.vertices, mesh.triangles, self._settings.spacing_mm, self._heights()
             )
+            cameras = {camera.name: camera for camera in self._cameras}
+            options = _options(self._settings, self._cameras, mesh)
+            self._registrar = Registrar(surface, cameras, images, options)
         return self._registrar
 
     def _heights(self) -> Floats | None:
@@ -336,10 +339,12 @@ def _options(settings: TrackSettings, cameras: CameraArray, neutral: Mesh) -> Re
     bending = (settings.bending_coarse_mm, settings.bending_mm)
     return RegistrarOptions(
         steps=schedule(levels, settings.search_mm * px_per_mm, settings.passes, bending),
-        spacing_mm=settings.spacing_mm,
-        half_window=settings.half_window_px,
-        half_window_coarse=settings.half_window_coarse_px,
-        min_cosine=settings.min_cosine,
+        windows=ReferenceWindows(
+            levels=levels,
+            half=settings.half_window_px,
+            half_coarse=settings.half_window_coarse_px,
+            min_cosine=settings.min_cosine,
+        ),
         min_correlation=settings.min_correlation,
         search_stride=settings.search_stride,
         rotation_iterations=settings.rotation_iterations,

@@ -1,0 +1,151 @@
+"""One round's measurements: every view warped into its reference, matched, and lifted to 3D."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+
+from capture.arrays import Bools, Floats, Floats32, Ints
+from recon.surface import Scan
+from track.beyond import search_beyond
+from track.evidence import ViewMatches, view_matches
+from track.face_reference import FaceReference
+from track.flow import ALIGNED, FlowMatches, better, refine_flow, search_flow
+from track.guide import GuidedView, guided_view
+from track.lift import Lifted, Observations, merged, triangulate
+from track.observe import believable, observe
+from track.reference import ReferenceLevel
+from track.scan_depth import ScanDepth, depth_observations
+from track.schedule import Step
+from track.surface_model import SurfaceModel
+
+_PRIOR_MM = 1.0
+_FEW = 2  # a sample that no more views than this see gets its depth from the scan too
+_SECOND_HAND = 0.25  # information of a match to another frame than the neutral: it has erred itself
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RoundImages:
+    """What a round sees of the frame.
+
+    Attributes:
+        views: the frame's images at the round's level, by device name.
+        occluders: a depth map of the mesh in the frame for each view, and how many of the level's
+            pixels one of its pixels spans; empty when nothing is known to be hidden.
+        depth: the frame's scan, where it is wanted.
+        stride: every how manieth sample is matched.
+    """
+
+    views: Mapping[str, Floats32]
+    occluders: Mapping[str, tuple[Floats32, float]]
+    depth: ScanDepth | None
+    stride: int
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Matcher:
+    """Matches frames to references.
+
+    Attributes:
+        surface: what is tracked.
+        references: the neutral first; the others serve samples that it does not.
+        min_correlation: least NCC believed.
+        pool: threads over the views; the kernels let go of the interpreter.
+    """
+
+    surface: SurfaceModel
+    references: Sequence[FaceReference]
+    min_correlation: float
+    pool: ThreadPoolExecutor
+
+    def measure(
+        self, step: Step, vertices: Floats, seen: RoundImages
+    ) -> tuple[Lifted, dict[str, ViewMatches]]:
+        """Match every view at one level and lift the samples.
+
+        Args:
+            step: the round.
+            vertices: (V, 3) the mesh's estimate, world mm.
+            seen: the frame.
+
+        Returns:
+            The samples' motions from the estimate, and each view's matches.
+        """
+        skin = self.surface.skin(vertices)
+        points = self.surface.samples.points(skin)
+
+        def measure(name: str) -> list[ViewMatches]:
+            return self._view(step, name, (skin, points), seen)
+
+        every = list(self.pool.map(measure, seen.views))  # in the order of the views
+        matches = {name: parts[0] for name, parts in zip(seen.views, every, strict=True)}
+        told = [part.observations for parts in every for part in parts]
+        if seen.depth is not None:
+            firsthand = {name: parts.observations for name, parts in matches.items()}
+            told += self._depths(seen.depth, firsthand, skin)
+        lifted = triangulate(merged(told), len(self.surface.samples), step.scale_px, _PRIOR_MM)
+        return lifted, matches
+
+    def scan_depth(self, scan: Scan, vertices: Floats, agreed: Ints) -> ScanDepth:
+        """The scan around samples that few views agreed on (N,), and any view can see."""
+        poor = (self.references[0].seen > 0) & (agreed <= _FEW)
+        return ScanDepth(scan, self.surface.samples.points(self.surface.skin(vertices))[poor])
+
+    def _view(
+        self, step: Step, name: str, estimate: tuple[Floats, Floats], seen: RoundImages
+    ) -> list[ViewMatches]:
+        """One view matched to the neutral, and what fails there to the other references."""
+        skin, points = estimate
+        image, occluders = seen.views[name], seen.occluders.get(name)
+        out: list[ViewMatches] = []
+        missing: Bools = np.ones(len(points), np.bool_)
+        for reference in self.references:
+            if name not in reference.views:
+                continue
+            level = reference.views[name][step.level]
+            chosen = missing[level.samples] & (level.samples % seen.stride == 0)
+            if out and not chosen.any():
+                continue
+            view = guided_view(level, self.surface.triangles, skin, image, occluders)
+            matches = _match(step, level, (view, image), chosen)
+            believed = believable(matches, self.min_correlation, step.limit_px)
+            told = observe(level, view, matches, points, believed)
+            if reference is not self.references[0]:
+                told = told.at(_SECOND_HAND)
+            out.append(view_matches(level, view, matches.correlation, told))
+            missing[told.sample] = False
+        return out
+
+    def _depths(
+        self, depth: ScanDepth, seen: Mapping[str, Observations], skin: Floats
+    ) -> list[Observations]:
+        """What the scan adds to the matches of samples that few views see."""
+        samples = self.surface.samples
+        times = np.zeros(len(samples), np.int64)
+        for part in seen.values():
+            times[part.sample] += 1
+        normals = samples.points(self.surface.normals(skin))
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+        estimate = (samples.points(skin), normals)
+        views = self.references[0].views
+        return [
+            depth_observations(
+                depth, views[name][0].camera, part, times[part.sample] <= _FEW, estimate
+            )
+            for name, part in seen.items()
+        ]
+
+
+def _match(
+    step: Step, level: ReferenceLevel, shown: tuple[GuidedView, Floats32], chosen: Bools
+) -> FlowMatches:
+    view, image = shown
+    found = search_flow(level, view, chosen, step.search_px)
+    matches = refine_flow(level, view, found.displacement, step.iterations)
+    lost = chosen & level.at_edge & (matches.correlation < ALIGNED)
+    return better(
+        matches, search_beyond(level, view, image, lost, (step.search_px, step.iterations))
+    )

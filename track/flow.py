@@ -168,10 +168,12 @@ def _inside(image: Any, x0: int, y0: int, margin: int, patch: Any) -> bool:
 def correlation_at(patch: Any, image: Any, x0: int, y0: int) -> float:
     """Weighted NCC of a template with the image at one whole-pixel place."""
     mean = square = cross = np.float32(0.0)
+    middle = patch.shape[1] // 2
+    grey = image[y0 + middle, x0 + middle]  # keeps the sums small: their digits are in the variance
     for j in range(patch.shape[1]):
         weight, value, row = patch[0, j], patch[1, j], image[y0 + j]
         for i in range(patch.shape[2]):
-            w = row[x0 + i]
+            w = row[x0 + i] - grey
             gw = weight[i] * w
             mean += gw
             square += gw * w
@@ -359,13 +361,15 @@ def _cubic(t: Any) -> tuple[Any, Any, Any, Any]:
 def _residual(patch: Any, values: Any) -> tuple[float, float, float]:
     """NCC, and the steepest descent images times the normalised difference."""
     mean = square = cross = bx = by = np.float32(0.0)
+    grey = values[patch.shape[1] // 2, patch.shape[1] // 2]  # keeps the sums small
     for j in range(patch.shape[1]):
         weight, value, across, along = patch[0, j], patch[1, j], patch[2, j], patch[3, j]
         line = values[j]
         for i in range(patch.shape[2]):
-            gw = weight[i] * line[i]
+            w = line[i] - grey
+            gw = weight[i] * w
             mean += gw
-            square += gw * line[i]
+            square += gw * w
             cross += gw * value[i]
             bx += gw * across[i]
             by += gw * along[i]

@@ -30,13 +30,21 @@ class QualityReport:
     """Quality of a take in numbers by frame and in words.
 
     Attributes:
-        rows: of each frame: `likely_error_mm` (95th percentile over the face's seen skin), `flagged`, `why`,
+        rows: of each frame: `likely_error_mm` (95th percentile over the face's seen skin),
+            `flagged`, `why`,
             and medians over the skin of `quality.npz`'s arrays; None where there is no number.
         views: what is wrong with views throughout the take.
     """
 
     rows: tuple[Mapping[str, Any], ...]
     views: tuple[str, ...]
+
+    def joined(self, report: Mapping[str, Any]) -> dict[str, Any]:
+        """The stage's report with this one's rows in its `frames`, and its words beside them."""
+        rows = [{**row, **own} for row, own in zip(report["frames"], self.rows, strict=True)]
+        flagged = [row["frame"] for row in self.rows if row["flagged"]]
+        words = {"flagged_frames": flagged, "view_remarks": list(self.views)}
+        return {**report, "frames": rows, **words}
 
 
 def write_quality_report(

@@ -24,11 +24,11 @@ from tools.verbs import correct_actions as actions
 from tools.verbs.options import Options, parse_frames
 from track.corrections import edits
 from track.corrections.checks import Subject
+from track.corrections.edits import Change
 from track.corrections.entries import (
     Anchor,
     Correction,
     Curve,
-    Entry,
     FrameExclusion,
     Lock,
     Pin,
@@ -91,16 +91,15 @@ def run(arguments: Arguments, progress: Progress) -> dict[str, Any]:
         return desk.listing(arguments.json)
     if isinstance(action, actions.Undo | actions.Redo):
         turn = edits.undo if isinstance(action, actions.Undo) else edits.redo
-        went, came = turn(take.folder, desk.subject)
-        return desk.report(came=came, went=went)
+        return desk.report(turn(take.folder, desk.subject))
     if isinstance(action, actions.Remove):
-        return desk.report(went=edits.remove(take.folder, desk.subject, action.ids))
+        return desk.report(edits.remove(take.folder, desk.subject, action.ids))
     if isinstance(action, actions.UnlockFrames):
-        return desk.report(went=desk.unlock(parse_frames(action.frames, take.frames)))
+        return desk.report(desk.unlock(parse_frames(action.frames, take.frames)))
     if isinstance(action, actions.LockFrames):
-        return desk.report(came=desk.lock(parse_frames(action.frames, take.frames), remarks))
+        return desk.report(desk.lock(parse_frames(action.frames, take.frames), remarks))
     corrections = _corrections(action, desk)
-    return desk.report(came=edits.add(take.folder, desk.subject, corrections, remarks))
+    return desk.report(edits.add(take.folder, desk.subject, corrections, remarks))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -127,16 +126,16 @@ class _Desk:
             mesh = read_obj(neutral or take.neutral())
         return cls(take=take, subject=Subject.of(take, mesh), performance=performance)
 
-    def report(self, came: Sequence[Entry] = (), went: Sequence[Entry] = ()) -> dict[str, Any]:
+    def report(self, change: Change) -> dict[str, Any]:
         """What changed, and what new pins would do to the mesh as it is tracked."""
         out: dict[str, Any] = {"file": str(self.take.folder / FILE)}
-        if came:
-            out["added"] = [f"{entry.id}: {entry}" for entry in came]
-        if went:
-            out["removed"] = [f"{entry.id}: {entry}" for entry in went]
-        if not came and not went:
+        if change.came:
+            out["added"] = [f"{entry.id}: {entry}" for entry in change.came]
+        if change.went:
+            out["removed"] = [f"{entry.id}: {entry}" for entry in change.went]
+        if len(out) == 1:
             out["unchanged"] = "it says so already"
-        for entry in came:
+        for entry in change.came:
             if isinstance(entry.what, Pin) and (told := self._told(entry.what)):
                 out[f"pin {entry.id}"] = told
         return out
@@ -155,7 +154,7 @@ class _Desk:
             return out | {"entries": [entry.table() for entry in entries]}
         return out | {str(entry.id): str(entry) for entry in entries}
 
-    def lock(self, frames: Sequence[int], remarks: Remarks) -> list[Entry]:
+    def lock(self, frames: Sequence[int], remarks: Remarks) -> Change:
         """Lock frames to the performance.
 
         Raises:
@@ -177,7 +176,7 @@ class _Desk:
         }
         return edits.lock(self.take.folder, self.subject, kept, remarks)
 
-    def unlock(self, frames: Sequence[int]) -> list[Entry]:
+    def unlock(self, frames: Sequence[int]) -> Change:
         """Remove the locks of frames.
 
         Raises:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from capture.errors import InputError, TakeError, raise_all
@@ -23,12 +23,20 @@ from track.corrections.sidecar import (
 )
 
 
+@dataclass(frozen=True, kw_only=True)
+class Change:
+    """What a step did: entries that hold since, and entries that no longer do."""
+
+    came: tuple[Entry, ...] = ()
+    went: tuple[Entry, ...] = ()
+
+
 def add(
     folder: Path,
     subject: Subject,
     corrections: Sequence[Correction],
     remarks: Remarks | None = None,
-) -> list[Entry]:
+) -> Change:
     """Add corrections to a take, in one step.
 
     A pin of a point that is pinned at that frame already takes its place: it keeps the old one's
@@ -41,7 +49,7 @@ def add(
         remarks: on all of them.
 
     Returns:
-        The entries made; none when the take has them all already.
+        The entries made and those they replace; none when the take has them all already.
 
     Raises:
         InputError: listing what does not fit; nothing is changed then.
@@ -49,23 +57,21 @@ def add(
     _check(folder, corrections, subject)
     book = read_book(folder, subject)
     held, fresh = list(book.entries), itertools.count(book.next_id)
-    gone: list[Entry] = []
     for what in corrections:
         rivals = [entry for entry in held if _same_place(entry.what, what)]
         merged = _successor(rivals[0].what, what) if rivals else what
         if any(merged == entry.what for entry in held):
             continue
         held = [entry for entry in held if entry not in rivals]
-        gone += rivals
         held.append(Entry(id=next(fresh), what=merged, remarks=remarks or Remarks()))
-    made = [entry for entry in held if entry.id >= book.next_id]
-    if made:
-        old = tuple(entry for entry in gone if entry.id < book.next_id)
-        _save(folder, subject, book, held, Step(numbers=_ids(made), entries=old))
-    return made
+    came = tuple(entry for entry in held if entry.id >= book.next_id)
+    went = tuple(entry for entry in book.entries if entry not in held)
+    if came:
+        _save(folder, subject, book, held, Step(numbers=_ids(came), entries=went))
+    return Change(came=came, went=went)
 
 
-def remove(folder: Path, subject: Subject, numbers: Iterable[int]) -> list[Entry]:
+def remove(folder: Path, subject: Subject, numbers: Iterable[int]) -> Change:
     """Remove the entries of these ids from a take's corrections, in one step.
 
     Raises:
@@ -79,16 +85,16 @@ def remove(folder: Path, subject: Subject, numbers: Iterable[int]) -> list[Entry
         raise InputError(
             f"{folder}: no correction {', '.join(map(str, strange))}; there are: {known}"
         )
-    gone = [entry for entry in book.entries if entry.id in wanted]
-    if gone:
+    went = tuple(entry for entry in book.entries if entry.id in wanted)
+    if went:
         left = [entry for entry in book.entries if entry.id not in wanted]
-        _save(folder, subject, book, left, Step(entries=tuple(gone)))
-    return gone
+        _save(folder, subject, book, left, Step(entries=went))
+    return Change(went=went)
 
 
 def lock(
     folder: Path, subject: Subject, frames: dict[int, LockedFrame], remarks: Remarks | None = None
-) -> list[Entry]:
+) -> Change:
     """Lock frames to the vertices given; frames that are locked already get these instead."""
     locks = {lock_of(frame, locked): locked for frame, locked in sorted(frames.items())}
     _check(folder, locks, subject)
@@ -97,11 +103,8 @@ def lock(
     return add(folder, subject, list(locks), remarks)
 
 
-def undo(folder: Path, subject: Subject) -> tuple[list[Entry], list[Entry]]:
+def undo(folder: Path, subject: Subject) -> Change:
     """Take back the last step of a take's corrections.
-
-    Returns:
-        The entries that went, and those that came back.
 
     Raises:
         InputError: when there is nothing to undo.
@@ -112,14 +115,11 @@ def undo(folder: Path, subject: Subject) -> tuple[list[Entry], list[Entry]]:
     step, entries = _turned(book, book.history[-1])
     new = Book(entries=entries, history=book.history[:-1], undone=(*book.undone, step))
     write_book(folder, new, subject)
-    return list(step.entries), list(book.history[-1].entries)
+    return Change(came=book.history[-1].entries, went=step.entries)
 
 
-def redo(folder: Path, subject: Subject) -> tuple[list[Entry], list[Entry]]:
+def redo(folder: Path, subject: Subject) -> Change:
     """Do the last step again that was undone, if nothing was changed since.
-
-    Returns:
-        The entries that went, and those that came back.
 
     Raises:
         InputError: when there is nothing to do again.
@@ -130,7 +130,7 @@ def redo(folder: Path, subject: Subject) -> tuple[list[Entry], list[Entry]]:
     step, entries = _turned(book, book.undone[-1])
     new = Book(entries=entries, history=(*book.history, step), undone=book.undone[:-1])
     write_book(folder, new, subject)
-    return list(step.entries), list(book.undone[-1].entries)
+    return Change(came=book.undone[-1].entries, went=step.entries)
 
 
 def _check(folder: Path, corrections: Iterable[Correction], subject: Subject) -> None:

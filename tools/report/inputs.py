@@ -20,6 +20,7 @@ from recon.mesh import Mesh, read_obj
 from rig.face_rig import FaceRig, read_rig
 from rig.template import Template, read_template
 from track.performance import Performance, read_performance
+from track.quality import TrackQuality, read_quality
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -88,6 +89,12 @@ class TakeInputs:
         """What tracking made, or None."""
         path = self.take.products / "track" / "performance.npz"
         return read_performance(path) if path.is_file() else None
+
+    @cached_property
+    def quality(self) -> TrackQuality | None:
+        """The quality of what tracking made, or None where it told none."""
+        path = self.take.products / "track" / "quality.npz"
+        return read_quality(path) if path.is_file() else None
 
     @cached_property
     def track_report(self) -> Mapping[str, Any]:

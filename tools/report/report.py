@@ -19,6 +19,7 @@ from tools.report.recording import capture_section
 from tools.report.shapes import rig_section
 from tools.report.surfaces import overlay_section, scan_section
 from tools.report.svg import escape
+from tools.report.track_quality import likely_error_section
 
 _Part = Callable[[ReportInputs], list[Section]]
 _PARTS: tuple[_Part, ...] = (
@@ -28,6 +29,7 @@ _PARTS: tuple[_Part, ...] = (
     calibration_section,
     scan_section,
     overlay_section,
+    likely_error_section,
     quality_section,
     rig_section,
     numbers_section,

@@ -82,9 +82,9 @@ Match descend(Sample own) {
         if (now.x <= NONE || turn == iterations)
             break;
         double bx = now.y, by = now.z;
-        vec2 step = vec2(xy * by - yy * bx, xy * bx - xx * by) / float(determinant);
-        float length_px = max(abs(step.x), abs(step.y));
-        shift += step * (MAX_STEP / max(length_px, MAX_STEP));
+        vec2 move = vec2(xy * by - yy * bx, xy * bx - xx * by) / float(determinant);
+        float length_px = max(abs(move.x), abs(move.y));
+        shift += move * (MAX_STEP / max(length_px, MAX_STEP));
         if (length_px < DONE)
             break;
     }

@@ -54,8 +54,8 @@ void search(ivec2 corner, float level, inout float best, inout int offset) {
     float mine = best;
     int which = -1;
     for (int number = lane(); number < across * across; number += LANES) {
-        ivec2 step = ivec2(number % across, number / across) - radius;
-        float score = shifted(corner + step, level);
+        ivec2 move = ivec2(number % across, number / across) - radius;
+        float score = shifted(corner + move, level);
         if (score > mine) {
             mine = score;
             which = number;
@@ -89,7 +89,7 @@ void main() {
     if (best <= aligned)
         search(corner, level, best, offset);
     if (lane() == 0) {
-        ivec2 step = offset < 0 ? ivec2(0) : ivec2(offset % across, offset / across) - radius;
-        matches[group()].found = vec4(vec2(step), best, 0.0);
+        ivec2 move = offset < 0 ? ivec2(0) : ivec2(offset % across, offset / across) - radius;
+        matches[group()].found = vec4(vec2(move), best, 0.0);
     }
 }

@@ -103,7 +103,8 @@ def test_older_takes_have_no_such_section(tmp_path: Path) -> None:
 def test_flagged_frames_come_first_then_the_worst() -> None:
     rows = [
         {"likely_error_mm": 0.0}, {"likely_error_mm": 3.0},
-        {"likely_error_mm": 1.2, "flagged": True}, {"likely_error_mm": None, "flagged": True}, {"likely_error_mm": 0.5},
+        {"likely_error_mm": 1.2, "flagged": True},
+        {"likely_error_mm": None, "flagged": True}, {"likely_error_mm": 0.5},
     ]  # fmt: skip
     assert worst_rows(rows, 3) == [2, 1, 4]
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -25,7 +25,6 @@ from capture.settings import check_ranges
 from track.features_bind import at_vertices, bind_pixels, inner_skin, surface_patches
 from track.features_detect import Keypoints, Region, Thresholds, detect, find_thresholds
 from track.features_match import (
-    SLACK_PX,
     STRETCH,
     Expected,
     MatchGates,
@@ -43,6 +42,12 @@ _BLOCK_PX = 8  # regions of search are drawn this coarsely
 _FOLDED = 0.05  # share of its area that skin keeps in the frame below which it is turned away
 _NOISE_PX = 0.3  # of a keypoint's place, px of the level,
 _BLUR = 0.05  # and per px of its size
+_SETTLED_PX = 1.0  # px of the level: rounds of registration with finer pixels do without features
+_SLACK_PX = 1.5  # of the level: motions of matches beside each other may differ by it
+_SLACK_MM = 0.5  # the same of patches
+_PATCH_VOTES = (8, 2)
+_MIN_VIEWS = 2
+_SURE_MM = 2.0  # deviation of a patch's place that its views leave
 _SCALE = 0.08  # of the region: what a patch that stretches leaves between its views
 
 
@@ -99,7 +104,7 @@ class FeatureRound:
 
 
 def feature_rounds(
-    level: int, radius_mm: float = 30.0, rounds: int = 3
+    level: int, radius_mm: float = 30.0, rounds: int = 2
 ) -> tuple[FeatureRound, ...]:
     """The rounds of a frame: the region shrinks, descriptors may differ more, the mesh is let go.
 
@@ -114,18 +119,20 @@ def feature_rounds(
     """
     if rounds < 1:
         raise SettingsError(f"rounds: expected at least 1, found {rounds}")
-    share = np.linspace(0.0, 1.0, rounds) if rounds > 1 else np.zeros(1)
     return tuple(
         FeatureRound(
             level=level,
-            radius_mm=float(radius_mm * 0.15**s),
+            radius_mm=radius_mm * 0.4**k,
             gates=MatchGates(
-                distance=0.5 + 0.2 * s, ratio=0.85 + 0.1 * s, octaves=0.8, turn=1.0 - 0.3 * s
+                distance=min(0.53 + 0.03 * k, 0.6),
+                ratio=0.85,
+                octaves=0.8,
+                turn=max(1 - 0.3 * k, 0.5),
             ),
-            spacing_mm=float(6.0 * 0.5**s),
-            bending_mm=float(8.0 * 0.375**s),
+            spacing_mm=max(6.0 - k, 3.0),
+            bending_mm=max(8.0 - 2.0 * k, 3.0),
         )
-        for s in share
+        for k in range(rounds)
     )
 
 
@@ -297,26 +304,51 @@ def match_features(
     def seen(name: str) -> tuple[Ints, Floats, Floats]:
         own, motion, precision = _matched(reference, name, frame[name], vertices, round_)
         camera = reference.cameras[name]
-        slack = SLACK_PX + STRETCH * round_.spacing_mm * float(_px_per_mm(camera, middle).mean())
+        slack = _SLACK_PX + STRETCH * round_.spacing_mm * float(_px_per_mm(camera, middle).mean())
         point, moved, weight = gathered(patch[own], motion, precision, slack)
         return point, camera.project(middle[point]) + moved, weight
 
     parts = list(reference.pool.map(seen, names))
     point = np.concatenate([np.zeros(0, np.int64), *(point for point, _, _ in parts)])
+    pixel = np.concatenate([np.zeros((0, 2)), *(pixel for _, pixel, _ in parts)])
     weight = np.concatenate([np.zeros(0), *(weight for _, _, weight in parts)])
-    used, place = np.unique(point, return_inverse=True)
-    view = np.repeat(np.arange(len(names)), [len(point) for point, _, _ in parts])
     sizes = [_px_per_mm(reference.cameras[name], middle).mean() for name in names]
     radius_px = round_.radius_mm * float(np.mean(sizes)) if sizes else 0.0
-    return Sightings(
-        surface=at_vertices(centres[used], reference.triangles),
+    everything = Sightings(
+        surface=at_vertices(centres, reference.triangles),
         cameras=names,
-        point=place.astype(np.int32),
-        view=view.astype(np.int32),
-        pixel=np.concatenate([np.zeros((0, 2)), *(pixel for _, pixel, _ in parts)]),
+        point=point.astype(np.int32),
+        view=np.repeat(np.arange(len(names), dtype=np.int32), [len(part[0]) for part in parts]),
+        pixel=pixel,
         information=np.column_stack([weight, np.zeros(len(weight)), weight]),
         scale_px=max(2.0**round_.level, _SCALE * radius_px),
-        accuracy_px=_NOISE_PX * 2.0**round_.level,
+        accuracy_px=_SETTLED_PX * 2.0**round_.level,
+    )
+    return _checked(everything, vertices, reference)
+
+
+def _checked(sightings: Sightings, vertices: Floats, reference: FeatureReference) -> Sightings:
+    """The sightings that views agree on, of patches that move as some of those around them do."""
+    lifted = sightings.lifted(vertices, reference.cameras)
+    told = lifted.information > _SURE_MM**-2.0
+    kept = np.flatnonzero((lifted.views >= _MIN_VIEWS) & told)
+    places = sightings.surface.points(reference.vertices)[kept]
+    agreed = np.zeros(len(told), np.bool_)
+    agreed[kept] = agreeing(places, lifted.motion[kept], _SLACK_MM, _PATCH_VOTES)
+    return _only(sightings, agreed)
+
+
+def _only(sightings: Sightings, kept: Bools) -> Sightings:
+    """The sightings of some of the points (P,)."""
+    own = kept[sightings.point]
+    place = (np.cumsum(kept) - 1).astype(np.int32)
+    return replace(
+        sightings,
+        surface=sightings.surface.select(np.flatnonzero(kept).astype(np.int32)),
+        point=place[sightings.point[own]],
+        view=sightings.view[own],
+        pixel=sightings.pixel[own],
+        information=sightings.information[own],
     )
 
 
@@ -347,10 +379,10 @@ def _matched(
     motion = frame.pixel[found[own]] - expected.pixel[own]
     settings = reference.settings
     voted = agreeing(
-        bound.keypoints.pixel[own] / 2.0**round_.level,
-        motion / 2.0**round_.level,
-        settings.neighbours,
-        settings.agreeing,
+        bound.keypoints.pixel[own],
+        motion,
+        _SLACK_PX * 2.0**round_.level,
+        (settings.neighbours, settings.agreeing),
     )
     own, motion = own[voted], motion[voted]
     deviation = _NOISE_PX * 2.0**round_.level + _BLUR * bound.keypoints.size[own]

@@ -13,8 +13,7 @@ from capture.arrays import Bools, Floats, Ints, check_shape
 from track.features_detect import Keypoints
 
 _SAME = 0.5  # candidates nearer to the best than this share of its size are the best once more
-SLACK_PX = 1.5  # neighbours' motions may differ by this much,
-STRETCH = 0.3  # and by this share of their distance
+STRETCH = 0.3  # share of their distance by which the motions of neighbours may differ
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,28 +95,28 @@ def match_keypoints(
     return found
 
 
-def agreeing(places: Floats, motion: Floats, neighbours: int, least: int) -> Bools:
+def agreeing(places: Floats, motion: Floats, slack: float, votes: tuple[int, int]) -> Bools:
     """Which matches move as some of their neighbours do.
 
     Not as most of them: where a mouth opens, half of a match's neighbours go another way. Chance
     alone makes two wrong matches agree about as often as their tolerance fits into the region.
 
     Args:
-        places: (N, 2) px of the reference.
-        motion: (N, 2) px from where each was expected to where it was found.
-        neighbours: how many of the nearest matches are asked.
-        least: how many of them must agree.
+        places: (N, D) where the matches are in the reference.
+        motion: (N, D) from where each was expected to where it was found.
+        slack: by how much the motions of neighbours may differ, beside a share of their distance.
+        votes: how many of the nearest matches are asked, and how many of them must agree.
 
     Returns:
         (N,) bool; none when there are too few matches to ask.
     """
+    asked, least = votes
     if len(places) <= least:
         return np.zeros(len(places), np.bool_)
-    count = min(neighbours + 1, len(places))
-    away, near = cKDTree(places).query(places, k=count)
+    away, near = cKDTree(places).query(places, k=min(asked + 1, len(places)))
     differs = np.linalg.norm(motion[near] - motion[:, None], axis=2)
-    same = (differs < SLACK_PX + STRETCH * away) & (away > 0.0)
-    voted: Bools = same.sum(axis=1) >= least
+    same = differs < slack + STRETCH * away
+    voted: Bools = same.sum(axis=1) - 1 >= least  # it agrees with itself
     return voted
 
 

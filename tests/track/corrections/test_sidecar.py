@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import copy
 import json
+import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,7 @@ from hypothesis import strategies as st
 
 from capture.errors import InputError, TakeError
 from tests.track.corrections.patch_subject import EVERY, MESH, SUBJECT, TRIANGLE, locked
+from tests.track.moving_patch import patch_array, patch_mesh
 from track.corrections.entries import Entry, Lock, Remarks
 from track.corrections.sidecar import (
     FILE,
@@ -164,6 +167,27 @@ def test_a_file_of_another_make_is_refused(
     document = written(tmp_path)
     document.update(change)
     assert words in refused(tmp_path, document)
+
+
+def test_the_worked_example_of_the_documentation_is_read(tmp_path: Path) -> None:
+    page = Path(__file__).resolve().parents[3] / "docs" / "corrections.md"
+    (block,) = re.findall(r"```json\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+    document = json.loads(re.sub(r'"([0-9a-f]{8})\.\.\."', rf'"\g<1>{"0" * 56}"', block))
+    del document["mesh"]  # it is of a mesh that nobody has
+    mesh = patch_mesh(40)
+    subject = replace(
+        SUBJECT,
+        frames=tuple(range(60)),
+        cameras=patch_array(16, 1024),
+        vertex_count=len(mesh.vertices),
+        triangles=mesh.triangles,
+    )
+    (tmp_path / FILE).write_text(json.dumps(document), encoding="utf-8")
+    book = read_book(tmp_path, subject)
+    assert [entry.what.kind for entry in book.entries] == [
+        *("pin", "curve", "exclude_frame", "exclude_view", "lock")
+    ]
+    assert len(book.history) == 5
 
 
 def test_what_is_no_object_is_refused(tmp_path: Path) -> None:

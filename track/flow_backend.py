@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Literal, Protocol
 
 from capture.arrays import Bools, Floats, Floats32, Ints32
+from capture.errors import SettingsError
 from track.flow import FlowMatches, refine_flow, search_flow
+from track.gpu_flow import GpuFlow
 from track.guide import GuidedView, guided_view
 from track.reference import ReferenceLevel
 
@@ -66,3 +68,19 @@ class CpuFlow:
     ) -> FlowMatches:
         """Refine displacements to a fraction of a pixel: `track.flow.refine_flow`."""
         return refine_flow(level, view, start, iterations)
+
+
+def make_flow(where: Literal["cpu", "gpu"]) -> FlowBackend:
+    """The dense flow of a process, on the processor or through OpenGL.
+
+    Args:
+        where: cpu, or gpu; the latter runs on whatever device OpenGL has, and is slow where that
+            is the processor again (`GpuFlow.device_name` says llvmpipe).
+
+    Raises:
+        SettingsError: when `where` is neither.
+        WorkError: for gpu, without headless OpenGL 4.3.
+    """
+    if where not in ("cpu", "gpu"):
+        raise SettingsError(f'flow: expected "cpu" or "gpu", found "{where}"')
+    return GpuFlow() if where == "gpu" else CpuFlow()

@@ -201,11 +201,20 @@ class FlowDevice:
         return found
 
     def fetched(self, buffer: Any, shape: tuple[int, ...], kind: Any) -> np.ndarray[Any, Any]:
-        """An array of what a buffer begins with."""
+        """An array of what a buffer begins with.
+
+        Raises:
+            WorkError: when OpenGL has met an error since it was last asked.
+        """
         out = np.empty(shape, kind)
         room = self._room("fetched", buffer.size)
         self._context.copy_buffer(room, buffer, (out.nbytes + 3) // 4 * 4)
         room.read_into(out, size=out.nbytes)
+        if (error := self._context.error) != "GL_NO_ERROR":  # out of memory, of this call or before
+            raise WorkError(
+                f"flow on the GPU: {self._context.info['GL_RENDERER']} reports {error}: use fewer "
+                'or smaller images, or flow = "cpu"'
+            )
         return out
 
     def _seen(self, view: GuidedView) -> _View:

@@ -16,7 +16,7 @@ from recon.mesh import Mesh
 from tests.synthetic import small_array
 from tests.track.moving_patch import patch_array, patch_motion, picture, skin, slit_mesh
 from track.flow import ALIGNED, FlowMatches
-from track.flow_backend import CpuFlow
+from track.flow_backend import CpuFlow, make_flow
 from track.gpu_context import current_context
 from track.gpu_flow import GpuFlow
 from track.guide import GuidedView
@@ -43,14 +43,16 @@ def _texture(size: int, shift: Floats, seed: int) -> Floats32:
     y, x = np.mgrid[0:size, 0:size].astype(float)
     points = 0.6 * np.column_stack([x.ravel() - shift[0], y.ravel() - shift[1], 0.0 * x.ravel()])
     noise = np.random.default_rng(seed).normal(0.0, 1.5 / 255, (size, size))
-    return (skin(points, seed).reshape(size, size) + noise).astype(np.float32)
+    grey = skin(points, seed).reshape(size, size) + noise
+    contrast = np.geomspace(0.005, 1.0, size)  # from nothing to all, over the columns
+    return (0.5 + contrast * (grey - 0.5)).astype(np.float32)
 
 
 def _rough_level(half: int, seed: int, size: int = SIZE) -> ReferenceLevel:
     """Samples all over an image, to its very edge, with windows that pieces of surface cut."""
     rng = np.random.default_rng(seed)
     image = _texture(size, np.zeros(2), seed)
-    image[: size // 6] = 0.5  # no texture
+    image[: size // 6] = 0.5
     rows, columns = np.gradient(image)
     centres = rng.integers(0, size, (500, 2)).astype(np.int32)
     side = 2 * half + 1
@@ -284,3 +286,20 @@ def test_an_image_beyond_the_devices_buffers_is_refused(gpu: GpuFlow) -> None:
     huge = replace(_rough_level(4, 6), image=np.broadcast_to(np.float32(0.0), (side, side)))
     with pytest.raises(WorkError, match=r'takes \d+ MiB: use smaller images or flow = "cpu"'):
         gpu.search(huge, _rough_view(6, (0.2, 0.3)), np.ones(500, bool), 1)
+
+
+def test_what_opengl_complains_of_is_told(gpu: GpuFlow) -> None:
+    level, view = _rough_level(4, 6), _rough_view(6, (0.2, 0.3))
+    with current_context() as context:
+        context.buffer(reserve=4).bind_to_storage_buffer(10**6)
+    start = np.zeros((len(level.samples), 2))
+    with pytest.raises(WorkError, match=r"reports GL_INVALID_VALUE: use fewer or smaller images"):
+        gpu.refine(level, view, start, 1)
+    gpu.refine(level, view, start, 1)
+
+
+def test_the_setting_chooses(gpu: GpuFlow) -> None:
+    assert isinstance(make_flow("cpu"), CpuFlow)
+    assert isinstance(make_flow("gpu"), type(gpu))
+    with pytest.raises(SettingsError, match='flow: expected "cpu" or "gpu", found "tpu"'):
+        make_flow("tpu")  # type: ignore[arg-type]

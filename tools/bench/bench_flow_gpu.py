@@ -156,7 +156,7 @@ def bench(size: int, rounds: int) -> dict[str, object]:
             "processor_ms": round(1e3 * (time.process_time() - processor) / rounds, 2),
         }
     line["level_sent_once_ms"] = round(sent_ms, 2)
-    line["cpu_over_gpu"] = round(whole["cpu"] / whole["gpu"], 2)
+    line["cpu_over_gpu"] = float(f"{whole['cpu'] / whole['gpu']:.3g}")
     line["difference"] = difference(results["cpu"], results["gpu"])
     return line
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TypeVar
 
 import numpy as np
@@ -106,6 +107,54 @@ def blend_confidence(
         gap = np.linalg.norm(new[0][frame].astype(np.float64) - old[0][frame], axis=1) / _GAP_MM
         mean = (1.0 - share) * old[1][frame] + share * new[1][frame]
         out[frame] = mean / (1.0 + 4.0 * share * (1.0 - share) * gap**2)
+    return out
+
+
+def ease_to_held(
+    vertices: NDArray[_Any], held: Mapping[int, NDArray[_Any]], reach_frames: int
+) -> NDArray[_Any]:
+    """Set some frames to given vertices, and ease the frames around into them.
+
+    What a held frame differs by from what stood there is spread to both sides, turned with the
+    head, and falls to 0 as a smoothstep over `reach_frames` frames or up to the next held one. A
+    frame that is to keep what it has is held to that.
+
+    Args:
+        vertices: (F, V, 3) mm.
+        held: by place in F, the vertices (V, 3) of that frame.
+        reach_frames: frames on each side that are moved at all; 0: none but the held ones.
+
+    Returns:
+        (F, V, 3): the held frames, and those out of reach of any, bit by bit.
+
+    Raises:
+        ShapeError: when reach_frames is below 0.
+        SolveError: when the vertices of a frame lie on one line.
+    """
+    check_shape(vertices=(vertices, "F V 3"))
+    if reach_frames < 0:
+        raise ShapeError(f"reach_frames: expected 0 or more, found {reach_frames}")
+    out, places = vertices.copy(), sorted(held)
+    added: dict[int, Floats] = {}
+    for index, place in enumerate(places):
+        away = held[place].astype(np.float64) - vertices[place]
+        low = places[index - 1] if index > 0 else -len(vertices)
+        high = places[index + 1] if index + 1 < len(places) else 2 * len(vertices)
+        spans = {-1: min(place - low, reach_frames + 1), 1: min(high - place, reach_frames + 1)}
+        first, last = place - spans[-1] + 1, place + spans[1] - 1
+        for frame in range(max(first, 0), min(last, len(vertices) - 1) + 1):
+            if frame == place or not away.any():
+                continue
+            side = spans[1 if frame > place else -1]
+            share = 1.0 - float(_smoothstep(np.array(abs(frame - place) / side)))
+            turn = fit_similarity(
+                vertices[place].astype(np.float64), vertices[frame].astype(np.float64)
+            ).rotation
+            added[frame] = added.get(frame, np.zeros_like(away)) + share * (away @ turn.T)
+    for frame, shift in added.items():
+        out[frame] = vertices[frame] + shift
+    for place, target in held.items():
+        out[place] = target
     return out
 
 

@@ -47,6 +47,8 @@ class FrameCorrections:
         locked: what the frame is and stays; nothing is solved then.
         excluded: the frame is to be interpolated between its neighbours; never so when locked.
         anchor: others may be matched to this frame.
+        kinds: of all that concerns it, "pin" or "exclude_view" say, each once; none: the frame is
+            as it was tracked.
     """
 
     frame: int
@@ -55,6 +57,7 @@ class FrameCorrections:
     locked: LockedFrame | None
     excluded: bool
     anchor: bool
+    kinds: tuple[str, ...]
 
 
 class Corrections:
@@ -120,6 +123,7 @@ class Corrections:
             locked=self._locked[frame] if locked else None,
             excluded=any(isinstance(what, FrameExclusion) for what in own) and not locked,
             anchor=any(isinstance(what, Anchor) for what in own),
+            kinds=tuple(sorted({what.kind for what in own})),
         )
 
     def key(self, frame: int) -> str:

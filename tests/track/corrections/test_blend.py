@@ -10,7 +10,13 @@ from hypothesis import strategies as st
 from capture.arrays import Bools, Floats
 from capture.errors import ShapeError
 from capture.pose import Pose
-from track.corrections.blend import blend, blend_confidence, blend_weights, interpolate
+from track.corrections.blend import (
+    blend,
+    blend_confidence,
+    blend_weights,
+    ease_to_held,
+    interpolate,
+)
 
 MASKS = st.lists(st.booleans(), min_size=1, max_size=40).map(lambda m: np.array(m, dtype=bool))
 
@@ -156,3 +162,44 @@ def test_uneven_frame_numbers_are_times() -> None:
 def test_something_must_be_known() -> None:
     with pytest.raises(ShapeError, match="expected at least one frame"):
         interpolate(turning_head(3), np.zeros(3, dtype=bool), np.arange(3))
+
+
+@pytest.mark.parametrize("reach", [0, 1, 5, 50])
+def test_held_frames_are_exact_and_their_neighbours_come_along(reach: int) -> None:
+    take = turning_head(24).astype(np.float32)
+    held = {6: take[6] + np.float32(1.5), 15: take[15], 18: take[18] - np.float32(0.5)}
+    out = ease_to_held(take, held, reach)
+    assert out.dtype == np.float32
+    assert all(out[place].tobytes() == target.tobytes() for place, target in held.items())
+    far = [f for f in range(24) if min(abs(f - place) for place in held) > reach]
+    assert out[far].tobytes() == take[far].tobytes()
+    moved = np.linalg.norm(out - take, axis=2)
+    assert np.ptp(moved, axis=1).max() < 1e-3  # mm: the whole head alike
+    moved = moved.mean(axis=1)
+    assert (moved[[16, 17]] <= np.sqrt(3) * 0.5).all()
+    near = moved[6 : 6 + min(reach, 8) + 2]
+    assert (np.diff(near) < 0.0).all()
+    assert np.abs(np.diff(near, n=2)).max(initial=0.0) < 6.0 * 2.6 / (min(reach, 8) + 1) ** 2
+
+
+def test_what_is_spread_turns_with_the_head() -> None:
+    take = turning_head(12)
+    turn = Pose.from_rotation_vector(np.radians([0.3, 1.5, 0.2]) * 4, np.zeros(3))
+    still = np.stack([take[0], turn.apply(take[0])])
+    out = ease_to_held(still, {0: still[0] + [0.0, 0.0, 3.0]}, 1)
+    expected = 0.5 * turn.rotation @ [0.0, 0.0, 3.0]
+    np.testing.assert_allclose(out[1] - still[1], np.tile(expected, (200, 1)), atol=1e-9)  # mm
+
+
+def test_a_frame_held_to_itself_shields_what_lies_behind_it() -> None:
+    take = turning_head(20)
+    out = ease_to_held(take, {5: take[5] + 2.0, 8: take[8]}, 10)
+    assert (out[8:] == take[8:]).all()
+    assert (out[6:8] != take[6:8]).any(axis=(1, 2)).all()
+
+
+def test_held_frames_give_the_same_whatever_their_order() -> None:
+    take = turning_head(20)
+    held = {3: take[3] + 1.0, 9: take[9] - 1.0, 12: take[12]}
+    turned = dict(reversed(held.items()))
+    assert ease_to_held(take, held, 4).tobytes() == ease_to_held(take, turned, 4).tobytes()

@@ -43,6 +43,7 @@ def test_frames_are_told_what_concerns_them() -> None:
     assert [f for f in frames if frames[f].anchor] == [8]
     assert [f for f in frames if frames[f].locked is not None] == [7]
     assert frames[7].locked is HELD[7]
+    assert [frames[f].kinds for f in (1, 2, 5)] == [(), ("pin",), ("exclude_frame", "exclude_view")]
     assert [len(frames[f].sightings) for f in frames] == [0, 0, 2, 1, 0, 0, 0, 0, 0, 0]
     assert isinstance(frames[3].sightings[0], CurveSightings)
     assert frames[3].sightings[0].weight == CURVE_WEIGHT

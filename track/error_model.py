@@ -30,8 +30,8 @@ _TAIL = 0.95  # share of seen skin whose error is below a frame's likely error
 _TINY_MM = 1e-4
 _LARGEST_MM = 30.0  # skin farther off is lost, by however much
 TERMS = (
-    "pixel", "triangulation", "reprojection", "motion", "motion_around", "misfit", "unlike",
-    "doubt", "doubt_around", "carried", "reach", "deformation",
+    "triangulation", "reprojection", "motion", "motion_around", "misfit", "doubt_around",
+    "carried", "reach", "deformation",
 )  # fmt: skip
 
 
@@ -42,10 +42,12 @@ class ErrorModel:
     Attributes:
         shares: of the terms, in their order: the median error is the root of the sum of squares
             of share times term.
+        haste: by how much all of a frame is worse for each mm that it still moved everywhere.
         spread: standard deviation of the logarithm of true over likely error.
     """
 
     shares: tuple[float, ...]
+    haste: float
     spread: float
 
     def __post_init__(self) -> None:
@@ -56,9 +58,24 @@ class ErrorModel:
             )
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Terms:
+    """What may turn into error in a frame.
+
+    Attributes:
+        mm: (K, V) by term and vertex, K as in `TERMS`; none below 0.
+        unsettled_mm: mean motion of the last round over all skin that was found.
+    """
+
+    mm: Floats
+    unsettled_mm: float
+
+
 # Fitted by tools/bench/fit_error_model.py; docs/tracking_quality.md tells on which takes.
 FITTED = ErrorModel(
-    shares=(0.1, 0.1, 0.42, 0.2, 0.82, 0.02, 0.01, 0.01, 0.09, 0.01, 0.032, 0.0024), spread=0.68
+    shares=(0.0405, 0.2092, 0.154, 0.7427, 0.4856, 0.0083, 0.8482, 0.0037, 0.0025),
+    haste=2.0243,
+    spread=0.613,
 )
 
 
@@ -94,19 +111,17 @@ def likely_errors(
 
 def error_terms(
     graph: SkinGraph, told: FrameEvidence, deformed_mm: Floats, mm_per_px: float
-) -> Floats:
-    """What may turn into error at each vertex, (K, V), K as in `TERMS`; all in mm, none below 0.
+) -> Terms:
+    """What may turn into error at each vertex of a frame.
 
     ::
 
-        pixel          mm that a pixel spans: what no evidence tells
         triangulation  standard deviation along an axis, from windows, correlation and angles
         reprojection   distance of agreeing matches from the mesh
         motion         what the last round still found to move; motion_around: in the mean around
         misfit         how far the mesh stayed from the triangulated points
-        unlike         1 - correlation, in pixels
-        doubt          share of the views that see it and do not agree, times the deformation;
-                       doubt_around: in the mean around
+        doubt_around   share of the views that see it and do not agree, in the mean around, times
+                       the deformation
         carried        of skin that was not found: deformation, the more the farther from found
         reach          of skin that was not found: distance along the surface to skin that was
         deformation    distance from the neutral, head motion taken out
@@ -125,27 +140,26 @@ def error_terms(
     sure = np.maximum(told.information.astype(np.float64), 1e-3)
     reach = np.where(found, 0.0, graph.reach(found))
     rows = {
-        "pixel": np.full(len(found), mm_per_px),
         "triangulation": np.where(told.information > 0, sure**-0.5, 0.0),
         "reprojection": told.reprojection_px * mm_per_px,
         "motion": moved,
         "motion_around": graph.around(moved, _ROUNDS),
         "misfit": told.misfit_mm,
-        "unlike": (1.0 - told.correlation) * mm_per_px,
-        "doubt": np.where(told.views_open >= _FOUND_VIEWS, doubt, 0.0) * deformed_mm,
         "doubt_around": graph.around(doubt, _ROUNDS) * deformed_mm,
         "carried": deformed_mm * reach / (reach + _HALFWAY_MM),
         "reach": reach,
         "deformation": deformed_mm,
     }
-    return np.nan_to_num(np.stack([rows[name] for name in TERMS]).astype(np.float64))
+    terms = np.nan_to_num(np.stack([rows[name] for name in TERMS]).astype(np.float64))
+    return Terms(mm=terms, unsettled_mm=_mean(moved[found]))
 
 
-def combined(terms: Floats, model: ErrorModel) -> Floats:
-    """Likely error (V,) mm of terms (K, V)."""
-    check_shape(terms=(terms, f"{len(TERMS)} V"))
+def combined(terms: Terms, model: ErrorModel) -> Floats:
+    """Likely error (V,) mm of a frame's terms."""
+    check_shape(terms=(terms.mm, f"{len(TERMS)} V"))
     shares = np.array(model.shares)[:, None]
-    likely: Floats = np.sqrt(((shares * terms) ** 2).sum(axis=0))
+    settled = np.sqrt(((shares * terms.mm) ** 2).sum(axis=0))
+    likely: Floats = settled * (1.0 + model.haste * terms.unsettled_mm)
     return likely
 
 
@@ -165,6 +179,11 @@ def frame_error(likely_mm: Floats | Floats32, model: ErrorModel | None = None) -
         below = float(ndtr((middle - centre) / chosen.spread).mean())
         low, high = (middle, high) if below < _TAIL else (low, middle)
     return float(np.exp(0.5 * (low + high)))
+
+
+def _mean(values: Floats) -> float:
+    known = values[np.isfinite(values)]
+    return float(known.mean()) if len(known) else 0.0
 
 
 class SkinGraph:

@@ -107,7 +107,8 @@ def _good(count: int) -> dict[str, np.ndarray]:
     view = {key: np.full(VIEWS, value, np.float32) for key, value in views.items()}
     view["view_correlation"] = np.full(VIEWS, 0.95, np.float32)
     view["view_residual_px"] = np.full(VIEWS, 0.08, np.float32)
-    return {**vertex, **view, "view_offset_px": np.zeros((VIEWS, 2), np.float32)}
+    blank = FrameEvidence.nothing(count, VIEWS).arrays()
+    return {**blank, **vertex, **view, "view_offset_px": np.zeros((VIEWS, 2), np.float32)}
 
 
 def _evidence(mesh: Mesh) -> list[FrameEvidence]:

@@ -27,6 +27,7 @@ from track.error_model import (
     TERMS,
     ErrorModel,
     SkinGraph,
+    Terms,
     combined,
     error_terms,
     frame_error,
@@ -47,11 +48,11 @@ _SEEN_VIEWS = 1.5
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Sample:
-    """One frame with its truth: terms (K, V), error (V,) mm, seen skin (V,)."""
+    """One frame with its truth: terms, error (V,) mm, seen skin (V,)."""
 
     take: str
     frame: int
-    terms: Floats
+    terms: Terms
     error_mm: Floats
     seen: Bools
 
@@ -119,31 +120,36 @@ def fit(samples: Sequence[Sample]) -> ErrorModel:
     All vertices count, hidden ones too. Errors of every size count alike, however rare they are:
     a vertex weighs as the inverse root of how many have an error like its own.
     """
-    terms = np.concatenate([sample.terms for sample in samples], axis=1)
+    terms = np.concatenate([sample.terms.mm for sample in samples], axis=1)
+    moved = np.concatenate([np.full_like(s.error_mm, s.terms.unsettled_mm) for s in samples])
     error = np.concatenate([sample.error_mm for sample in samples])
-    rng = np.random.default_rng(_SEED)
-    pick = rng.permutation(len(error))[:_MOST]
+    pick = np.random.default_rng(_SEED).permutation(len(error))[:_MOST]
     square, goal = terms[:, pick] ** 2, np.log(np.maximum(error[pick], _LEAST_MM))
-    weight = _even(goal)
+    moved, weight = moved[pick], _even(goal)
 
-    def cost(log_shares: Floats) -> tuple[float, Floats]:
-        share = np.exp(2.0 * log_shares)
-        total = share @ square + 1e-9
-        miss = 0.5 * np.log(total) - goal
+    def cost(logs: Floats) -> tuple[float, Floats]:
+        share, haste = np.exp(2.0 * logs[:-1]), float(np.exp(logs[-1]))
+        total, factor = share @ square + 1e-9, 1.0 + haste * moved
+        miss = 0.5 * np.log(total) + np.log(factor) - goal
         inside = np.abs(miss) < _HUBER
         loss = np.where(inside, 0.5 * miss**2, _HUBER * (np.abs(miss) - 0.5 * _HUBER))
-        slope = weight * np.clip(miss, -_HUBER, _HUBER) / total
-        return float((weight * loss).sum()), (square @ slope) * share
+        pull = weight * np.clip(miss, -_HUBER, _HUBER)
+        slopes = np.append((square @ (pull / total)) * share, (pull * haste * moved / factor).sum())
+        return float((weight * loss).sum()), slopes
 
-    start = np.full(len(TERMS), np.log(0.2))
+    start = np.full(len(TERMS) + 1, np.log(0.2))
+    bounds = [(np.log(1e-4), np.log(10.0))] * len(start)
     found = minimize(
-        cost, start, jac=True, method="L-BFGS-B", bounds=[(np.log(1e-4), np.log(10.0))] * len(TERMS)
+        cost, start, jac=True, method="L-BFGS-B", bounds=bounds,
+        options={"maxiter": 2000, "ftol": 1e-12, "gtol": 1e-9},
+    )  # fmt: skip
+    *shares, haste = (float(np.round(value, 4)) for value in np.exp(found.x))
+    trial = ErrorModel(shares=tuple(shares), haste=haste, spread=1.0)
+    told = np.concatenate([combined(sample.terms, trial) for sample in samples])[pick]
+    low, high = np.percentile(goal - np.log(np.maximum(told, 1e-4)), [16.0, 84.0])
+    return ErrorModel(
+        shares=trial.shares, haste=haste, spread=float(np.round(0.5 * (high - low), 3))
     )
-    shares = tuple(float(np.round(share, 4)) for share in np.exp(found.x))
-    trial = ErrorModel(shares=shares, spread=1.0)
-    miss = goal - np.log(np.maximum(combined(terms[:, pick], trial), 1e-4))
-    low, high = np.percentile(miss, [16.0, 84.0])
-    return ErrorModel(shares=shares, spread=float(np.round(0.5 * (high - low), 3)))
 
 
 def flag_count(samples: Sequence[Sample], model: ErrorModel, limit_mm: float) -> FlagCount:
@@ -215,7 +221,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             s for take, _, truth in pairs for s in read_samples(Path(take), Path(truth))
         ]
     model = fit(groups["fit"]) if groups["fit"] else FITTED
-    print(f"spread {model.spread}")
+    print(f"spread {model.spread}, haste {model.haste}")
     for term, share in zip(TERMS, model.shares, strict=True):
         print(f"  {term:15s} {share:.4f}")
     print("shares=(" + ", ".join(f"{share:g}" for share in model.shares) + ")")

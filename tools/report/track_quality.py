@@ -21,11 +21,11 @@ from tools.report.svg import element, escape, number
 from tools.report.track_strip import StripRow, strip_chart
 from track.performance import Performance
 from track.quality import CARRIED, TrackQuality
+from track.quality_report import FLAG_MM
 
 _WORST = 6  # frames with pictures, of all takes together
 _LISTED = 24  # flagged frames in words
 _DARK_MM = 2.0  # the dark end of likely errors
-_FLAG_MM = 1.0
 _PORTRAIT = 300  # px
 _YAWS = (-0.7, 0.7)
 _ROWS = (  # of the strip: figure, words, light end, dark end
@@ -95,7 +95,7 @@ def _curve(rows: Sequence[Mapping[str, Any]]) -> str:
         Series(name="half below", x=x, y=[_value(row, "likely_median_mm") for row in rows]),
     ]
     labels = Labels(title="likely error over time", x="frame", y="likely error, mm")
-    limit = (_FLAG_MM, f"flagged above {_FLAG_MM:g} mm")
+    limit = (FLAG_MM, f"flagged above {FLAG_MM:g} mm")
     chart = line_chart(series, labels, limit=limit, height=170.0)
     return figure(chart, "Likely error over the seen skin of the face, as the error model tells.")
 

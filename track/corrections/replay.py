@@ -33,6 +33,8 @@ CURVE_WEIGHT = 20.0
 """Of a vertex of an ordinary curve against a good sample of the flow."""
 _PIN_PX, _CURVE_PX = 0.25, 0.5  # standard deviations of a hand
 _NEVER_DOUBTED_PX = 1000.0  # what an artist says is no outlier, however far from the estimate
+_FIXING_VIEWS = 2  # that leave a point no freedom
+_HALF_FIXED = 0.5  # confidence in a point that one view or a curve speaks of
 _NONE = "none"
 
 
@@ -58,6 +60,19 @@ class FrameCorrections:
     excluded: bool
     anchor: bool
     kinds: tuple[str, ...]
+
+    def assured(self, vertex_count: int) -> Floats:
+        """How far pins and curves vouch for each vertex, (V,) 0..1, whatever the images say.
+
+        1 at a vertex that is pinned in two views or more, half of that where one view pins it or a
+        curve passes; a point inside a triangle shares it out among the corners.
+        """
+        out = np.zeros(vertex_count)
+        for sighted in self.sightings:
+            views = np.bincount(sighted.point, minlength=len(sighted.surface))
+            sure = np.where(views >= _FIXING_VIEWS, 1.0, _HALF_FIXED)
+            np.maximum.at(out, sighted.surface.corners, sure[:, None] * sighted.surface.barycentric)
+        return out
 
 
 class Corrections:

@@ -109,6 +109,17 @@ def test_a_pin_is_no_outlier_however_far_it_is() -> None:
     assert np.abs(lifted.motion[0] - [0.0, 25.0, 0.0]).max() < 1.0  # mm: one linear step of 25
 
 
+def test_pinned_vertices_are_vouched_for() -> None:
+    told = corrections(*EVERY)
+    pinned = told.for_frame(2).assured(len(MESH.vertices))
+    assert pinned[100] == 0.5  # by one view
+    assert sorted(pinned[list(TRIANGLE)]) == [0.25, 0.25, 0.5]  # two views, shared out
+    assert (pinned > 0).sum() == 4
+    drawn = told.for_frame(3).assured(len(MESH.vertices))
+    assert np.flatnonzero(drawn).tolist() == [40, 41, 42, 43]
+    assert not told.for_frame(9).assured(len(MESH.vertices)).any()
+
+
 def test_pins_of_one_weight_go_together() -> None:
     told = corrections(*EVERY).for_frame(2).sightings
     assert [one.weight for one in told] == [0.5 * PIN_WEIGHT, PIN_WEIGHT]

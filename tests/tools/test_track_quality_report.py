@@ -77,7 +77,15 @@ def test_worst_frames_are_pictured_over_plates_and_upright(inputs: ReportInputs)
     pictured = re.findall(r"Likely error, frame (\d+) over", body)
     assert pictured[0] == "2"
     assert set(pictured) <= {"1", "2"}  # the first is the neutral; of the last nothing is told
-    assert body.count("data:image/jpeg") == 4 * len(pictured)
+    errors = body[: body.index("<h4>Texture stability</h4>")]
+    assert errors.count("data:image/jpeg") == 4 * len(pictured)
+
+
+def test_texture_is_watched_in_words_numbers_and_pictures(inputs: ReportInputs) -> None:
+    body = likely_error_section(inputs)[0].body
+    texture = body[body.index("<h4>Texture stability</h4>") :]
+    assert "<th>median, px</th>" in texture
+    assert re.findall(r"Residual flow, frame (\d+) in", texture.split("<figcaption>", 1)[1])
 
 
 def test_all_figures_can_be_taken_away(inputs: ReportInputs, tmp_path: Path) -> None:

@@ -19,11 +19,13 @@ from tools.report.shade import Studio, studio_camera
 from tools.report.surfaces import framed, front_views
 from tools.report.svg import element, escape, number
 from tools.report.track_strip import StripRow, strip_chart
+from tools.report.track_texture import texture_part
 from track.performance import Performance
 from track.quality import CARRIED, TrackQuality
 from track.quality_report import FLAG_MM
 
 _WORST = 6  # frames with pictures, of all takes together
+_WATCHED = 6  # frames whose texture is watched, of all takes together
 _LISTED = 24  # flagged frames in words
 _DARK_MM = 2.0  # the dark end of likely errors
 _PORTRAIT = 300  # px
@@ -52,6 +54,7 @@ def likely_error_section(inputs: ReportInputs) -> list[Section]:
         parts.append(_remarks(item))
         parts.append(_flags(rows))
         parts += _pictures(item, rows, max(1, _WORST // len(judged)))
+        parts.append(texture_part(item, _watched(rows, max(1, _WATCHED // len(judged)))))
         parts.append(folded("every frame in numbers", _numbers(item, rows)))
         verdicts.append(_verdict(item, rows))
     if not parts:
@@ -66,6 +69,12 @@ def worst_rows(rows: Sequence[Mapping[str, Any]], count: int) -> list[int]:
     told = [k for k in range(len(rows)) if _value(rows[k], "likely_error_mm") > 0.0]
     told.sort(key=lambda k: (not rows[k].get("flagged"), -_value(rows[k], "likely_error_mm")))
     return told[:count]
+
+
+def _watched(rows: Sequence[Mapping[str, Any]], count: int) -> list[int]:
+    """The worst frames, and as many spread over the take."""
+    spread = np.rint(np.linspace(0, len(rows) - 1, count // 2 + 2)).astype(int).tolist()[1:]
+    return sorted({*worst_rows(rows, count - count // 2), *spread} - {0})
 
 
 def _rows(item: TakeInputs) -> list[Mapping[str, Any]]:

@@ -96,6 +96,19 @@ def test_blur_light_and_delay_touch_what_they_should(visit: Path, tmp_path: Path
             assert np.abs(np.diff(soft)).mean() < 0.9 * np.abs(np.diff(sharp)).mean()
 
 
+def test_a_neutral_off_the_skin_keeps_its_height(visit: Path, tmp_path: Path) -> None:
+    _, out = faulty(visit, tmp_path / "off", "off the skin")
+    before, after = (
+        read_archive(folder / "truth.npz", ["vertices"])["vertices"] for folder in (visit, out)
+    )
+    neutral = read_obj(out / "neutral.obj")
+    assert np.allclose(neutral.vertices, after[0], atol=1e-4)
+    height = (after - before)[:, :, 2]  # the wall moves in its plane, but for the head's turn
+    assert np.sqrt((height[0] ** 2).mean()) == pytest.approx(0.2, abs=0.05)
+    assert np.abs(height - height[0]).max() < 0.01
+    assert np.array_equal(read(out, "cam05", 2), read(visit, "cam05", 2))
+
+
 def test_flags_are_counted_by_frame() -> None:
     row = flagging([True, True, False, False, True], [True, False, True, False, True])
     assert (row["bad"], row["flagged"], row["frames"]) == (3, 3, 5)

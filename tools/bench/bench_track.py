@@ -1,11 +1,12 @@
 """Tracking against truth: `python -m tools.bench.bench_track TAKE [--score SCORE_TRACK.py]`.
 
-Tracks a visiting take from its neutral.obj: with several settings (`--cases`), under faults put
-into its images (`--faults`), and by the opponent (`--cases opponent`). One JSON line each: errors
+Tracks a visiting take from its neutral.obj: with several settings and by the opponent (`--cases`),
+as it is and under faults put into it (`--faults`). One JSON line for each of each: errors
 over skin that two cameras see (by `--score`, called with TRUTH PERFORMANCE, such as score_track.py;
 without it, over confident skin by this module), CPU and wall seconds a frame, and memory. Then one
-line for all: how well flagged frames tell those whose p95 is over a millimetre. The truth is read
-here only, after the stage is done.
+line for all: how well flagged frames of the default settings tell those whose p95 is over a
+millimetre. The truth is read here only, after the stage is done. What normal displacements earn is
+told by `--scan --cases default "without scan" --faults off`.
 """
 
 from __future__ import annotations
@@ -27,9 +28,16 @@ from capture.arrays import Bools, Floats
 from capture.camera_file import read_cameras
 from capture.take import Take
 from recon.mesh import Mesh, read_obj, vertex_normals
+from recon.scan import reconstruct
 from recon.visiting import import_take
 from tools.bench.cost import measured
-from tools.bench.track_faults import flagged_frames, flagging, take_faults, write_faulty
+from tools.bench.track_faults import (
+    TakeFault,
+    flagged_frames,
+    flagging,
+    take_faults,
+    write_faulty,
+)
 from tools.bench.track_opponent import follow_take
 from track.performance import Performance, write_performance
 from track.stage import TrackSettings, track
@@ -113,10 +121,21 @@ def frame_p95(source: Path, performance: Performance, neutral: Mesh) -> Floats:
     return np.array(rows)
 
 
-def run(source: Path, follow: Follow, score: Path | None) -> tuple[dict[str, Any], _Flags]:
-    """Track a visiting take in a fresh folder and measure it: a row, and what was flagged."""
+def run(
+    source: Path, follow: Follow, score: Path | None, scan: bool = False
+) -> tuple[dict[str, Any], _Flags]:
+    """Track a visiting take in a fresh folder and measure it: a row, and what was flagged.
+
+    Args:
+        source: the take.
+        follow: how.
+        score: script that scores it; None: `compare`.
+        scan: make a scan of the first frame before.
+    """
     with TemporaryDirectory() as folder:
         take = import_take(source, Path(folder) / "take")
+        if scan:
+            reconstruct(take, [take.frames[0]])
         neutral = read_obj(take.neutral())
         performance, cost = measured(lambda: follow(Take.open(take.folder), neutral))
         frames = len(performance.frames)
@@ -160,31 +179,38 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--score", type=Path, help="script called with TRUTH PERFORMANCE")
     parser.add_argument("--cases", nargs="*", default=["default"], choices=[*cases, OPPONENT])
     parser.add_argument("--faults", default=None, help='only those with these words; "" for all')
+    parser.add_argument("--scan", action="store_true", help="with a scan of the first frame")
     options = parser.parse_args(arguments)
     flags = _Flags()
-
-    def tell(words: dict[str, Any], source: Path, follow: Follow) -> None:
-        row, found = run(source, follow, options.score)
-        print(json.dumps({**words, **row}), flush=True)
-        flags.bad.extend(found.bad)
-        flags.flagged.extend(found.flagged)
-
-    for name in options.cases:
-        if name == OPPONENT:
-            tell({"case": name}, options.take, follow_take)
-        else:
-            changed = _changed(cases[name])
-            tell({"case": name, "settings": changed}, options.take, _tracker(cases[name]))
-    if options.faults is not None:
-        names = read_cameras(options.take / "cameras.json").names
-        count = len(read_archive(options.take / "truth.npz", ["vertices"])["vertices"])
-        for fault in take_faults(names, count):
-            if options.faults in fault.words:
-                with TemporaryDirectory() as folder:
-                    write_faulty(options.take, Path(folder) / "visit", fault)
-                    tell({"fault": fault.words}, Path(folder) / "visit", _tracker(TrackSettings()))
+    for fault in _chosen_faults(options.take, options.faults):
+        with TemporaryDirectory() as folder:
+            source = options.take
+            if fault.words:
+                source = Path(folder) / "visit"
+                write_faulty(options.take, source, fault)
+            for name in options.cases:
+                words: dict[str, Any] = {"fault": fault.words or "none", "case": name}
+                follow: Follow = follow_take
+                if name != OPPONENT:
+                    words["settings"] = _changed(cases[name])
+                    follow = _tracker(cases[name])
+                row, found = run(source, follow, options.score, options.scan)
+                print(json.dumps({**words, **row}), flush=True)
+                if name == "default":
+                    flags.bad.extend(found.bad)
+                    flags.flagged.extend(found.flagged)
     if flags.bad:
         print(json.dumps({"flags": flagging(flags.bad, flags.flagged)}), flush=True)
+
+
+def _chosen_faults(source: Path, wanted: str | None) -> list[TakeFault]:
+    """None at first, and the faults with these words; none of them when they are None."""
+    none = [TakeFault(words="")]
+    if wanted is None:
+        return none
+    names = read_cameras(source / "cameras.json").names
+    count = len(read_archive(source / "truth.npz", ["vertices"])["vertices"])
+    return none + [fault for fault in take_faults(names, count) if wanted in fault.words]
 
 
 def _tracker(settings: TrackSettings) -> Follow:

@@ -1,8 +1,9 @@
 """Faults of a take, made from a good one's images: what tracking has to bear, or to flag.
 
 A visiting take with truth is written again with devices gone, every other frame gone (so that all
-moves twice as far from frame to frame), frames blurred, light that flickers, or a device that runs
-a frame late. Nothing is rendered; the first frame stays as it was, as a take's neutral is chosen.
+moves twice as far from frame to frame), frames blurred, light that flickers, a device that runs a
+frame late, or a neutral that is not quite on the skin. Nothing is rendered; the first frame stays
+as it was, as a take's neutral is chosen.
 """
 
 from __future__ import annotations
@@ -17,13 +18,15 @@ import cv2
 import numpy as np
 
 from capture.archive import read_archive, write_archive
-from capture.arrays import Image
+from capture.arrays import Floats, Image
 from capture.camera import CameraArray
 from capture.camera_file import read_cameras, write_cameras
 from capture.errors import TakeError, WorkError
+from recon.mesh import Mesh, read_obj, vertex_normals, write_obj
 
 _BLUR = 3.0 / 1024.0  # standard deviation over the width of the image
 _BLURRED, _FLICKER, _SEED = 0.10, 0.12, 23
+_OFF_MM, _WAVE_MM = 0.2, np.array([45.0, 60.0, 80.0])
 
 ReadImage = Callable[[str, int], Image]
 
@@ -36,12 +39,15 @@ class TakeFault:
         words: what it is.
         gone: devices without images.
         step: every how manieth frame stays.
+        off_mm: how far the neutral lies off the skin, rms, in smooth bumps; the truth then keeps
+            that height over the skin.
         change: the image of a device (name) and frame, given all images; None leaves it.
     """
 
     words: str
     gone: tuple[str, ...] = ()
     step: int = 1
+    off_mm: float = 0.0
     change: Callable[[ReadImage, str, int], Image] | None = None
 
 
@@ -63,6 +69,7 @@ def take_faults(names: Sequence[str], frame_count: int) -> list[TakeFault]:
         TakeFault(words="blurred frames", change=_blurring(frozenset(soft.tolist()))),
         TakeFault(words="flickering light", change=_flickering(gains.tolist())),
         TakeFault(words="one device a frame late", change=_delaying(late)),
+        TakeFault(words="neutral off the skin", off_mm=_OFF_MM),
     ]
 
 
@@ -94,8 +101,10 @@ def write_faulty(source: Path, out: Path, fault: TakeFault) -> None:
             elif not cv2.imwrite(str(path), fault.change(read, camera.name, frame)):
                 raise WorkError(f"{path}: cannot be written")
     write_cameras(out / "cameras.json", kept)
-    shutil.copyfile(source / "neutral.obj", out / "neutral.obj")
-    write_archive(out / "truth.npz", {**truth, "vertices": truth["vertices"][:: fault.step]})
+    mesh = read_obj(source / "neutral.obj")
+    placed = _lifted(truth["vertices"][:: fault.step].astype(np.float64), mesh, fault.off_mm)
+    write_obj(out / "neutral.obj", mesh.with_vertices(placed[0]))
+    write_archive(out / "truth.npz", {**truth, "vertices": placed.astype(np.float32)})
 
 
 def flagged_frames(report: Path) -> list[int] | None:
@@ -116,6 +125,14 @@ def flagging(bad: Sequence[bool], flagged: Sequence[bool]) -> dict[str, float]:
         "recall": round(hits / sum(bad), 3) if any(bad) else 1.0,
         "precision": round(hits / sum(flagged), 3) if any(flagged) else 1.0,
     }
+
+
+def _lifted(frames: Floats, mesh: Mesh, off_mm: float) -> Floats:
+    """Each frame's vertices (F, V, 3) off the skin along its normals, by bumps fixed to it."""
+    height = off_mm * np.sqrt(2.0) * np.sin((frames[0] * (2.0 * np.pi / _WAVE_MM)).sum(axis=1))
+    normals = [np.nan_to_num(vertex_normals(frame, mesh.triangles)) for frame in frames]
+    lifted: Floats = frames + height[:, None] * np.stack(normals)
+    return lifted
 
 
 def _blurring(frames: frozenset[int]) -> Callable[[ReadImage, str, int], Image]:

@@ -118,6 +118,20 @@ def test_search_equals_the_processors(gpu: GpuFlow, half: int, radius: int) -> N
         assert (other.correlation[moved] > ALIGNED).sum() > 20
 
 
+def test_of_equal_matches_the_first_in_reading_order_wins(gpu: GpuFlow) -> None:
+    rng = np.random.default_rng(0)
+    stripes = np.tile(rng.uniform(0.2, 0.8, (SIZE, 4)), (1, SIZE // 4 + 1))[:, :SIZE]
+    level = replace(_rough_level(6, 0), image=stripes.astype(np.float32))
+    solid, place = np.ones((SIZE, SIZE), np.uint8), np.zeros((SIZE, SIZE, 2), np.float32)
+    view = GuidedView(image=np.roll(level.image, 2, axis=1), place=place, solid=solid)
+    every = np.ones(len(level.samples), bool)
+    for flow in (CpuFlow(), gpu):
+        found = flow.search(level, view, every, 3)
+        matched = ~_unmatched(found) & (found.correlation > 0.999)
+        assert matched.sum() > 50
+        assert (found.displacement[matched] == [-2.0, 0.0]).all()
+
+
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_refinement_equals_the_processors(gpu: GpuFlow, seed: int) -> None:
     level, view = _rough_level(6, seed), _rough_view(seed, (0.43, -0.71))
@@ -210,11 +224,12 @@ def test_the_warp_equals_the_processors(gpu: GpuFlow, scene: Scene, occluded: bo
     assert (hidden.sum() > 1500) == occluded
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_what_leaves_the_image_or_lies_behind_the_camera_is_not_shown(
-    gpu: GpuFlow, scene: Scene
+    gpu: GpuFlow, scene: Scene, sign: float
 ) -> None:
     camera, mesh, level, guide, image, _ = scene
-    far = guide + [45.0, 0.0, 0.0]
+    far = guide + sign * np.array([35.0, 30.0, 0.0])
     far[::40] = camera.centre + 20.0 * (camera.centre - guide.mean(axis=0))
     far[7] = np.nan
     one, other = (flow.warp(level, mesh.triangles, far, image) for flow in (CpuFlow(), gpu))

@@ -21,7 +21,7 @@ VENDORS = {
     "pxr": r"rig/export_usd\.py",
     "pygltflib": r"rig/export_gltf\.py",
     "tyro": r"tools/(cli|__main__)\.py|tools/verbs/\w+\.py|tools/actor/\w+\.py|tools/\w+\.py",
-    "dlib": r"(?!)",
+    "dlib": r"track/landmark_dlib\.py",
     "dask": r"tools/engine/\w+\.py",
     "cv2": r"(recon|track|tools)/.*",
     "scipy": r"(recon|track|rig|tools)/.*",

@@ -29,6 +29,7 @@ VERBS: dict[str, str] = {
     "calibrate": "solve the cameras of an array from a board take",
     "recon": "reconstruct the surface of frames by stereo",
     "neutral": "register a template mesh to the actor at the first frame",
+    "landmarks": "find lips, lids, brows and nose in every frame, by a predictor of this actor",
     "track": "track the neutral mesh through a take",
     "correct": "pin, draw, lock or leave out what tracking is to be told",
     "rig": "solve a personalised blendshape rig from performances",
@@ -43,6 +44,7 @@ _STAGES = {
     "calibrate": ("recon.array_solver", "CalibrateSettings"),
     "recon": ("recon.scan", "ReconSettings"),
     "neutral": ("track.neutral", "NeutralSettings"),
+    "landmarks": ("track.landmark_stage", "LandmarkSettings"),
     "track": ("track.stage", "TrackSettings"),
     "rig": ("rig.stage", "RigSettings"),
 }

@@ -120,7 +120,7 @@ def _figures(quality: TrackQuality, row: int, skin: Bools) -> dict[str, float | 
     return {
         "reprojection_px": _median(quality.reprojection_px[row], found),
         "ncc": _median(quality.correlation[row], found),
-        "views_used": _median(quality.views_used[row], skin),
+        "views_used": _median(quality.views_used[row], skin) if row else None,
         "scan_distance_mm": _median(quality.scan_distance_mm[row], skin),
         "jitter_mm": _median(quality.jitter_mm[row], skin),
         "round_trip_mm": _rounded(float(quality.round_trip_mm[row])),

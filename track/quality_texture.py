@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from capture.arrays import Bools, Floats, Floats32
 from capture.camera import Camera
@@ -25,6 +26,9 @@ _LIGHT_PX = 8.0  # light and contrast are those of a neighbourhood of this stand
 _RIM_PX = 7  # pixels beside the edge of what is shown are left out: flow bleeds across it
 _FLAT = 0.006  # standard deviation of skin, images in 0..1, below which there is nothing to see
 _LEAST = 200  # pixels that a view must show
+_ALIKE = 0.5  # correlation, flow taken out, below which a view shows something else
+
+Pixels = NDArray[np.uint8]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -33,7 +37,8 @@ class ResidualFlow:
 
     Attributes:
         flow_px: (H, W, 2) float32, px of the view; NaN where the skin is not shown in both.
-        median_px: of its length; NaN when too little skin is shown.
+        median_px: of its length; NaN when too little skin is shown, or none that the reference
+            shows too, as in a frame that was lost or overexposed.
         p95_px: its 95th percentile.
     """
 
@@ -95,9 +100,12 @@ class TextureWatch:
         depth = self._raster.render(level.camera, vertices).depth
         view = guided_view(level, self._triangles, vertices, image, (depth, 1.0))
         shown = _inner(view.solid > 0) & _textured(level.image)
+        before, after = _even(level.image), _even(view.image)
         engine = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
         engine.setFinestScale(0)
-        found = engine.calc(_even(level.image), _even(view.image), None)  # type: ignore[call-overload]
+        found = engine.calc(before, after, None)  # type: ignore[call-overload]
+        if not _alike(before, after, np.asarray(found), shown):
+            shown = np.zeros_like(shown)
         flow = np.where(shown[:, :, None], found, np.nan).astype(np.float32)
         length = np.linalg.norm(flow[shown], axis=1)
         if len(length) < _LEAST:
@@ -106,12 +114,23 @@ class TextureWatch:
         return ResidualFlow(flow_px=flow, median_px=median, p95_px=tail)
 
 
-def _even(image: Floats32) -> cv2.typing.MatLike:
+def _even(image: Floats32) -> Pixels:
     """A picture freed of its light and contrast, 8 bits."""
     mean = cv2.GaussianBlur(image, (0, 0), _LIGHT_PX)
     away = image - mean
     size = np.sqrt(cv2.GaussianBlur(away * away, (0, 0), _LIGHT_PX)) + _FLAT
-    return np.clip(128.0 + 48.0 * away / size, 0.0, 255.0).astype(np.uint8)
+    even: Pixels = np.clip(128.0 + 48.0 * away / size, 0.0, 255.0).astype(np.uint8)
+    return even
+
+
+def _alike(before: Pixels, after: Pixels, flow: Floats32, shown: Bools) -> bool:
+    """Whether the pictures show the same once the flow is taken out; noise does not."""
+    y, x = np.indices(shown.shape, dtype=np.float32)
+    back = cv2.remap(after, x + flow[..., 0], y + flow[..., 1], cv2.INTER_LINEAR)
+    one, two = before[shown].astype(np.float64), back[shown].astype(np.float64)
+    if len(one) < _LEAST or one.std() < 1e-6 or two.std() < 1e-6:
+        return False
+    return float(np.corrcoef(one, two)[0, 1]) > _ALIKE
 
 
 def _textured(image: Floats32) -> Bools:

@@ -18,6 +18,7 @@ _APART = 0.25  # share of a view's matches that agree, below what is usual in th
 _BLIND = 0.05  # share of a view's samples that match at all, below which it shows no skin
 _TOLD_MM = 0.5  # regions likely to be off by less are not spoken of
 _REGIONS = 3
+_NAMED = 4  # views that are listed by name
 _LAG_FRAMES = 0.3
 _SLOW_PX = 0.3  # skin that moves less a frame tells nothing of lateness
 
@@ -100,13 +101,11 @@ def take_words(habits: ViewHabits) -> list[str]:
 
 def _whole_frame(told: FrameEvidence, habits: ViewHabits, present: Bools) -> list[str]:
     words = []
-    absent = [name for name, there in zip(habits.names, present, strict=True) if not there]
-    if absent:
-        words.append(f"{len(absent)} of {len(present)} views missing: {', '.join(absent)}")
+    if not present.all():
+        words.append(f"{_listed(habits.names, ~present)} missing")
     blind = _blind(told)
     if blind.any():
-        names = [name for name, dark in zip(habits.names, blind, strict=True) if dark]
-        words.append(f"{', '.join(names)}: no skin that matches")
+        words.append(f"no skin that matches in {_listed(habits.names, blind)}")
     usable = present & ~blind
     fell = habits.correlation - told.view_correlation > _FELL
     if usable.any() and fell[usable].mean() >= _ALL_VIEWS:
@@ -166,10 +165,11 @@ def _view_words(told: FrameEvidence, habits: ViewHabits, present: Bools) -> list
 
 
 def _agreed(told: FrameEvidence) -> Floats:
-    """Share (C,) of each view's believed matches that agree with the others; NaN without any."""
+    """Share (C,) of each view's believed matches that agree with the others; NaN of hardly any."""
     believed = told.view_believed.astype(np.float64)
     gap = np.full(len(believed), np.nan)
-    share: Floats = np.divide(told.view_agreed, believed, out=gap, where=believed > 0)
+    enough = (believed > 0) & ~_blind(told)
+    share: Floats = np.divide(told.view_agreed, believed, out=gap, where=enough)
     return share
 
 
@@ -214,6 +214,14 @@ def _median(values: Floats) -> Floats:
 def _mean(values: Floats32) -> float:
     known = values[np.isfinite(values)]
     return float(known.mean()) if len(known) else 0.0
+
+
+def _listed(names: Sequence[str], chosen: Bools) -> str:
+    """Views by name, or how many when they are too many to read."""
+    picked = [name for name, wanted in zip(names, chosen, strict=True) if wanted]
+    if len(picked) > _NAMED:
+        return f"{len(picked)} of {len(names)} views"
+    return ", ".join(picked)
 
 
 def _percent(share: float) -> str:

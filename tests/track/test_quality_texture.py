@@ -61,4 +61,7 @@ def test_views_without_the_frame_or_the_skin_tell_nothing(
     away = MESH.vertices + np.array([500.0, 0.0, 0.0])
     found = watch.residual(away, {camera.name: image})[camera.name]
     assert np.isnan(found.median_px)
+    noise = np.random.default_rng(2).normal(0.5, 0.02, image.shape).astype(np.float32)
+    found = watch.residual(MESH.vertices, {camera.name: noise})[camera.name]
+    assert np.isnan(found.median_px)
     assert np.isnan(found.flow_px).all()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +13,7 @@ import numpy as np
 from capture.arrays import Bools, Floats, Ints, Ints32, check_shape
 from capture.documents import read_json
 from capture.errors import ShapeError, TakeError, raise_all
+from capture.product import replacing
 from recon.mesh import Mesh
 from track.face_landmarks import LANDMARK_NAMES, LANDMARKS
 from track.surface_match import MatchSurface
@@ -112,6 +114,12 @@ def read_landmark_map(path: Path, mesh: Mesh) -> LandmarkMap:
         problems.append("no landmarks: expected vertices or points")
     raise_all(f"{path}", problems, TakeError)
     return found
+
+
+def write_landmark_map(path: Path, where: LandmarkMap) -> None:
+    """Write what `read_landmark_map` reads, whole or not at all."""
+    with replacing(path) as partial:
+        partial.write_text(json.dumps(where.document(), indent=1) + "\n", encoding="utf-8")
 
 
 def map_beside(mesh_path: Path) -> Path:

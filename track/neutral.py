@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from capture.archive import write_archive
 from capture.arrays import Floats
@@ -25,9 +26,11 @@ from capture.product import (
 from capture.progress import Progress, silent
 from capture.settings import check_ranges
 from capture.take import Take
+from recon.images import mono
 from recon.mesh import Mesh, read_obj, write_obj
 from recon.scan import load_scan, reconstruct
 from recon.surface import Scan
+from track.appearance import bake_appearance
 from track.landmark_file import Landmarks, read_landmarks
 from track.nonrigid import Fit, NonrigidFit, Step
 from track.placement import Placement, Placer, Viewpoint, place_by_landmarks
@@ -107,8 +110,10 @@ def register_neutral(
     """Register a template face mesh, placed or not, to the actor at the first frame of a take.
 
     The scan of that frame is taken from the take's products, and made when it is not there.
-    Beside `out` (world mm, the template's polygons and uv) stand `OUT.report.json` and
-    `OUT.residual.npz` (residual_mm (V,), -1 where unmatched) without the suffix of `out`.
+    Beside `out` (world mm, the template's polygons and uv) stand, without its suffix,
+    `OUT.report.json`, `OUT.residual.npz` (residual_mm (V,), -1 where unmatched) and
+    `OUT.appearance.npz` (grey (C, V) of every vertex in every view, -1 where the view does not
+    show it; camera_names (C)).
 
     Args:
         take: whose first frame is neutral; it has cameras.
@@ -148,6 +153,7 @@ def register_neutral(
         partial.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
     residual = np.nan_to_num(fit.residual_mm, nan=-1.0).astype(np.float32)
     write_archive(out.with_suffix(".residual.npz"), {"residual_mm": residual})
+    write_archive(out.with_suffix(".appearance.npz"), _appearance(take, mesh))
     write_obj(out, mesh)
     write_record(out, record)
     return read_obj(out)  # as a second run finds it: what is made of it is then current
@@ -219,6 +225,16 @@ def _place(template: Mesh, scan: Scan, view: Viewpoint, landmarks: Landmarks | N
         motion = place_by_landmarks(marked, landmarks.positions)
         return Placement(world_from_template=motion, score_mm=float("nan"))
     return Placer((template.vertices, template.triangles), surface, view).search()
+
+
+def _appearance(take: Take, mesh: Mesh) -> dict[str, NDArray[Any]]:
+    """What every view of the first frame shows at the vertices."""
+    frame = take.frames[0]
+    cameras = {camera.name: camera for camera in take.cameras()}
+    images = {name: mono(take.image(name, frame)) for name in cameras if take.present(name, frame)}
+    grey = bake_appearance(mesh.vertices, mesh.triangles, cameras, images)
+    names = np.array(list(cameras))
+    return {"grey": np.nan_to_num(grey, nan=-1.0), "camera_names": names}
 
 
 def _scan_path(take: Take, progress: Progress) -> Path:

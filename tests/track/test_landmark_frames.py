@@ -18,7 +18,13 @@ from track.landmark_frames import (
     read_frame_landmarks,
     write_frame_landmarks,
 )
-from track.landmark_map import map_beside, read_landmark_map, transferred, vertex_map
+from track.landmark_map import (
+    map_beside,
+    read_landmark_map,
+    transferred,
+    vertex_map,
+    write_landmark_map,
+)
 
 MESH = head(TEMPLATE)
 
@@ -129,6 +135,10 @@ def test_map_stands_beside_the_mesh_and_carries_over(tmp_path: Path) -> None:
         moved.surface.points(other.vertices) - known.surface.points(MESH.vertices), axis=1
     )
     assert gap.max() < 0.5  # mm: the two polyhedra differ by no more
+    write_landmark_map(path, moved)  # points inside triangles
+    read = read_landmark_map(path, other)
+    assert np.allclose(read.surface.barycentric, moved.surface.barycentric, atol=1e-6)
+    assert np.array_equal(read.surface.corners, moved.surface.corners)
     again = transferred(moved, other, MESH)
     back = again.surface.points(MESH.vertices) - known.surface.points(MESH.vertices)
     assert np.linalg.norm(back, axis=1).max() < 1.0

@@ -138,6 +138,11 @@ def test_stage_writes_whole_products_once_and_the_same_each_time(
     assert report["vertices"] == len(template.vertices)
     with np.load(tmp_path / "made" / "neutral.residual.npz") as data:
         assert ((data["residual_mm"] >= 0).sum()) == report["matched"]
+    with np.load(tmp_path / "made" / "neutral.appearance.npz") as data:
+        assert data["camera_names"].tolist() == list(cameras.names)
+        grey = data["grey"]
+    assert grey.shape == (len(cameras), len(template.vertices))
+    assert set(np.unique(grey)) == {-1.0, 0.0}  # the take's images are black
     assert told.count("register") == 3
     assert not list((tmp_path / "made").glob(".*"))
 

@@ -20,7 +20,7 @@ from recon.mesh import read_obj
 from rig.template import read_template
 from rig.transfer import transfer_shapes
 from tools.verbs.options import Options, parse_frames
-from track.landmark_map import map_beside, read_landmark_map
+from track.landmark_map import map_beside, read_landmark_map, transferred
 from track.landmark_stage import LandmarkSettings, detect_landmarks, train_landmarks
 
 REQUIRED = ("take", "neutral")
@@ -35,7 +35,9 @@ class Arguments(Options):
     neutral: Path
     """The neutral in tracking topology, registered to the first frame, OBJ, world mm."""
     map: Path | None = None
-    """Which vertices are landmarks, JSON; NEUTRAL.landmarks.json beside the mesh by default."""
+    """Which vertices are landmarks, JSON; by default the .landmarks.json beside the mesh."""
+    map_mesh: Path | None = None
+    """Another mesh of this actor at the same frame, OBJ, that the map counts vertices of."""
     template: Path | None = None
     """A rig template (.npz) of the neutral's topology: train on its expressions."""
     frames: str | None = None
@@ -50,7 +52,11 @@ def run(arguments: Arguments, progress: Progress) -> dict[str, Any]:
     take = Take.open(arguments.take)
     frames = parse_frames(arguments.frames, take.frames)
     mesh = read_obj(arguments.neutral)
-    where = read_landmark_map(arguments.map or map_beside(arguments.neutral), mesh)
+    marked = arguments.map_mesh or arguments.neutral
+    source = read_obj(marked)
+    where = read_landmark_map(arguments.map or map_beside(marked), source)
+    if arguments.map_mesh is not None:
+        where = transferred(where, source, mesh)
     shapes = None
     if arguments.template is not None:
         template = read_template(arguments.template)

@@ -1,6 +1,7 @@
 """Register a template mesh to the actor at the first frame, topology kept.
 
-Reconstructs the frame first when its scan is not there yet.
+Reconstructs the frame first when its scan is not there yet. A landmark map beside the template
+(head.landmarks.json) is carried along.
 Example: likeness neutral takes/neutral --template head.obj --out neutral.obj
 """
 
@@ -16,6 +17,7 @@ from capture.progress import Progress
 from capture.take import Take
 from recon.mesh import read_obj
 from tools.verbs.options import Options
+from track.landmark_map import map_beside, read_landmark_map, write_landmark_map
 from track.neutral import NeutralSettings, register_neutral
 
 REQUIRED = ("take", "template", "out")
@@ -49,4 +51,9 @@ def run(arguments: Arguments, progress: Progress) -> dict[str, Any]:
         landmarks=arguments.landmarks,
         progress=progress,
     )
-    return {"neutral": str(arguments.out), "vertices": len(mesh.vertices)}
+    report = {"neutral": str(arguments.out), "vertices": len(mesh.vertices)}
+    if (beside := map_beside(arguments.template)).is_file():
+        where = read_landmark_map(beside, mesh)  # the vertices are the same
+        write_landmark_map(map_beside(arguments.out), where)
+        report["landmark_map"] = str(map_beside(arguments.out))
+    return report

@@ -233,7 +233,8 @@ class FeatureReference:
         buffers = self._raster.render(camera, self.vertices)
         skin = inner_skin(camera, buffers, mesh, settings.min_cosine, settings.margin_px)
         share = min(1.0, int(skin.sum()) / _FULL_SKIN_PX)
-        thresholds, found = find_thresholds(image, skin, max(1, round(settings.keypoints * share)))
+        wanted = round(1.02 * settings.keypoints * share)  # some meet no triangle, at its rims
+        thresholds, found = find_thresholds(image, skin, max(1, wanted))
         surface = bind_pixels(found.pixel, camera, buffers, mesh)
         hit = np.flatnonzero(surface.triangle >= 0).astype(np.int32)
         return BoundKeypoints(

@@ -179,7 +179,7 @@ def detect_landmarks(
     figures: dict[str, Any] = {}
     for done, frame in enumerate(frames, start=1):
         images = {n: take.image(n, frame) for n in take.device_names if take.present(n, frame)}
-        path = folder / f"frame_{frame:04d}.json"
+        path = _frame_path(take, frame)
         try:
             found = detector.detect_frame(images, head, settings.passes)
         except SolveError as error:
@@ -196,13 +196,42 @@ def detect_landmarks(
     return report
 
 
+def import_landmarks(
+    take: Take, mesh: Mesh, path: Path, where: LandmarkMap | None = None
+) -> dict[str, Any]:
+    """Take over landmarks of any detector: checked, and a file for each frame of the take.
+
+    Args:
+        take: it has cameras.
+        mesh: the one that is tracked.
+        path: see `track.landmark_frames`.
+        where: the landmarks on the mesh, when the file does not tell.
+
+    Returns:
+        By frame, how many views.
+
+    Raises:
+        TakeError: listing what does not fit, by its place in the file.
+    """
+    given = read_frame_landmarks(path, mesh, take.cameras(), where)
+    stray = sorted(set(given.frames) - set(take.frames))
+    if stray:
+        raise TakeError(f"{path}: frames.{stray[0]}: the take has frames 0..{len(take.frames) - 1}")
+    for frame, views in given.frames.items():
+        write_frame_landmarks(
+            _frame_path(take, frame),
+            FrameLandmarks(where=given.where, accuracy_px=given.accuracy_px, frames={frame: views}),
+        )
+    return {str(frame): len(views) for frame, views in sorted(given.frames.items())}
+
+
 def stored_sightings(take: Take, mesh: Mesh, frame: int) -> list[Sightings]:
     """The landmarks that were found in a frame, as registration takes them; none when none were.
 
     Raises:
         TakeError: when the file does not fit the mesh or the cameras.
     """
-    path = take.products / _FOLDER / f"frame_{frame:04d}.json"
+    path = _frame_path(take, frame)
     if not path.is_file():
         return []
     return read_frame_landmarks(path, mesh, take.cameras()).sightings(frame)
@@ -210,8 +239,12 @@ def stored_sightings(take: Take, mesh: Mesh, frame: int) -> list[Sightings]:
 
 def stored_hash(take: Take, frame: int) -> str:
     """What a stage's record says of the landmarks of a frame."""
-    path = take.products / _FOLDER / f"frame_{frame:04d}.json"
+    path = _frame_path(take, frame)
     return hash_file(path) if path.is_file() else "none"
+
+
+def _frame_path(take: Take, frame: int) -> Path:
+    return take.products / _FOLDER / f"frame_{frame:04d}.json"
 
 
 def _write_frame(path: Path, frame: int, found: FrameFound, where: LandmarkMap) -> dict[str, Any]:

@@ -22,6 +22,7 @@ from track.landmark_expressions import landmark_shapes
 from track.landmark_stage import (
     LandmarkSettings,
     detect_landmarks,
+    import_landmarks,
     stored_hash,
     stored_sightings,
     train_landmarks,
@@ -98,6 +99,21 @@ def test_landmarks_are_found_where_they_are(take: Take, shapes: dict[str, np.nda
         read_model(folder, CAMERAS)
     with pytest.raises(TakeError, match="expected a dlib shape predictor"):
         ShapePredictor(folder / "cam07.dat")
+
+
+def test_landmarks_of_another_detector_are_taken_over(take: Take, tmp_path: Path) -> None:
+    path = tmp_path / "detected.json"
+    views = {name: {"lip_outer_0": [100.5, 200.25]} for name in take.device_names}
+    path.write_text(json.dumps({"frames": {"2": views}, "accuracy_px": 1.5}))
+    assert import_landmarks(take, MESH, path, WHERE) == {"2": 3}
+    (sightings,) = stored_sightings(take, MESH, 2)
+    assert sightings.accuracy_px == 1.5
+    assert sightings.pixel.tolist() == [[100.5, 200.25]] * 3
+    assert stored_hash(take, 2) != "none"
+    (take.products / "landmarks" / "frame_0002.json").unlink()
+    path.write_text(json.dumps({"frames": {"9": views}}))
+    with pytest.raises(TakeError, match=r"frames\.9: the take has frames 0\.\.2"):
+        import_landmarks(take, MESH, path, WHERE)
 
 
 def test_training_is_deterministic_and_learns(tmp_path: Path) -> None:

@@ -13,15 +13,22 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
+from capture.arrays import Floats
 from capture.errors import TakeError
 from capture.progress import Progress
 from capture.take import Take
-from recon.mesh import read_obj
+from recon.mesh import Mesh, read_obj
 from rig.template import read_template
 from rig.transfer import transfer_shapes
 from tools.verbs.options import Options, parse_frames
-from track.landmark_map import map_beside, read_landmark_map, transferred
-from track.landmark_stage import LandmarkSettings, detect_landmarks, train_landmarks
+from track.landmark_map import LandmarkMap, map_beside, read_landmark_map, transferred
+from track.landmark_stage import (
+    LandmarkSettings,
+    detect_landmarks,
+    import_landmarks,
+    train_landmarks,
+)
+from track.rigid import fit_similarity
 
 REQUIRED = ("take", "neutral")
 
@@ -40,6 +47,8 @@ class Arguments(Options):
     """Another mesh of this actor at the same frame, OBJ, that the map counts vertices of."""
     template: Path | None = None
     """A rig template (.npz) of the neutral's topology: train on its expressions."""
+    detections: Path | None = None
+    """Landmarks of another detector, JSON: taken over as they are, nothing is trained."""
     frames: str | None = None
     """Which frames: A:B (B excluded), A:B:STEP, A or A,B,C; all by default."""
     settings: Annotated[LandmarkSettings, tyro.conf.arg(name="")] = field(
@@ -48,35 +57,49 @@ class Arguments(Options):
 
 
 def run(arguments: Arguments, progress: Progress) -> dict[str, Any]:
-    """Train, detect, and report."""
+    """Train and detect, or take over, and report."""
     take = Take.open(arguments.take)
     frames = parse_frames(arguments.frames, take.frames)
     mesh = read_obj(arguments.neutral)
-    marked = arguments.map_mesh or arguments.neutral
-    source = read_obj(marked)
-    where = read_landmark_map(arguments.map or map_beside(marked), source)
-    if arguments.map_mesh is not None:
-        where = transferred(where, source, mesh)
-    shapes = None
-    if arguments.template is not None:
-        template = read_template(arguments.template)
-        if not np.array_equal(template.polygons, mesh.polygons):
-            raise TakeError(
-                f"{arguments.template}: its polygons are not those of {arguments.neutral}"
-            )
-        deltas = transfer_shapes(template, mesh.vertices)
-        shapes = dict(zip(template.names, deltas, strict=True))
+    folder = str(take.products / "landmarks")
+    if arguments.detections is not None:
+        own = _landmark_map(arguments, mesh) if _map_known(arguments) else None
+        taken = import_landmarks(take, mesh, arguments.detections, own)
+        return {"landmarks": folder, "frames": len(taken), "views": sum(taken.values())}
+    where = _landmark_map(arguments, mesh)
     detector = train_landmarks(
-        take, mesh, where, arguments.settings, shapes=shapes, progress=progress
-    )
+        take, mesh, where, arguments.settings,
+        shapes=_shapes(arguments, mesh), progress=progress,
+    )  # fmt: skip
     report = detect_landmarks(take, detector, where, arguments.settings, frames, progress=progress)
     found = [figures for figures in report["frames"].values() if figures["found"]]
-    return {
-        "landmarks": str(take.products / "landmarks"),
-        "frames": len(frames),
-        "found": len(found),
-        "accuracy_px": round(float(np.median([f["accuracy_px"] for f in found])), 3)
-        if found
-        else None,
-        "miss_mm": round(float(np.median([f["miss_mm"] for f in found])), 3) if found else None,
-    }
+    told: dict[str, Any] = {"landmarks": folder, "frames": len(frames), "found": len(found)}
+    for name in ("accuracy_px", "miss_mm"):
+        if found:
+            told[name] = round(float(np.median([figures[name] for figures in found])), 3)
+    return told
+
+
+def _map_known(arguments: Arguments) -> bool:
+    beside = map_beside(arguments.map_mesh or arguments.neutral)
+    return arguments.map is not None or beside.is_file()
+
+
+def _landmark_map(arguments: Arguments, mesh: Mesh) -> LandmarkMap:
+    marked = arguments.map_mesh or arguments.neutral
+    source = mesh if arguments.map_mesh is None else read_obj(marked)
+    where = read_landmark_map(arguments.map or map_beside(marked), source)
+    return where if arguments.map_mesh is None else transferred(where, source, mesh)
+
+
+def _shapes(arguments: Arguments, mesh: Mesh) -> dict[str, Floats] | None:
+    """The template's expressions on this actor; None when no template is given."""
+    if arguments.template is None:
+        return None
+    template = read_template(arguments.template)
+    if not np.array_equal(template.polygons, mesh.polygons):
+        raise TakeError(f"{arguments.template}: its polygons are not those of {arguments.neutral}")
+    placed = fit_similarity(template.neutral, mesh.vertices)  # transfer wants the template's axes
+    upright = (mesh.vertices - placed.translation) @ placed.rotation
+    deltas = transfer_shapes(template, upright) @ placed.rotation.T
+    return dict(zip(template.names, deltas, strict=True))

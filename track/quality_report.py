@@ -21,7 +21,7 @@ from track.quality import FOUND, TrackQuality, measure_quality, write_quality
 from track.quality_regions import face_regions
 from track.quality_words import frame_words, take_words, view_habits
 
-FLAG_MM = 0.8  # likely error above which a frame is flagged: so that few above 1 mm are missed
+FLAG_MM = 0.7  # likely error above which a frame is flagged: so that few above 1 mm are missed
 _DIGITS = 4
 
 

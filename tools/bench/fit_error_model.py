@@ -117,15 +117,16 @@ def read_samples(take: Path, truth: Path) -> list[Sample]:
 def fit(samples: Sequence[Sample]) -> ErrorModel:
     """Shares of the terms under which the logarithm of the error scatters least, robustly.
 
-    All vertices count, hidden ones too. Errors of every size count alike, however rare they are:
-    a vertex weighs as the inverse root of how many have an error like its own.
+    All vertices count, hidden ones too. Evidence of every size counts alike, however rare it is:
+    a vertex weighs as the inverse root of how many have terms of about its size. Weights by the
+    errors themselves would draw the rare ones apart from what told them.
     """
     terms = np.concatenate([sample.terms.mm for sample in samples], axis=1)
     moved = np.concatenate([np.full_like(s.error_mm, s.terms.unsettled_mm) for s in samples])
     error = np.concatenate([sample.error_mm for sample in samples])
     pick = np.random.default_rng(_SEED).permutation(len(error))[:_MOST]
     square, goal = terms[:, pick] ** 2, np.log(np.maximum(error[pick], _LEAST_MM))
-    moved, weight = moved[pick], _even(goal)
+    moved, weight = moved[pick], _even(0.5 * np.log(square.sum(axis=0) + _LEAST_MM**2))
 
     def cost(logs: Floats) -> tuple[float, Floats]:
         share, haste = np.exp(2.0 * logs[:-1]), float(np.exp(logs[-1]))
@@ -178,9 +179,10 @@ def reliability(samples: Sequence[Sample], model: ErrorModel) -> list[tuple[floa
     return rows
 
 
-def _even(goal: Floats) -> Floats:
-    count, edges = np.histogram(goal, bins=24)
-    place = np.clip(np.digitize(goal, edges) - 1, 0, len(count) - 1)
+def _even(size: Floats) -> Floats:
+    """Weights (N,) with sum 1 of vertices whose terms have these sizes, logarithmic."""
+    count, edges = np.histogram(size, bins=24)
+    place = np.clip(np.digitize(size, edges) - 1, 0, len(count) - 1)
     weight: Floats = 1.0 / np.sqrt(np.maximum(count[place], 1))
     even: Floats = weight / weight.sum()
     return even
@@ -193,7 +195,7 @@ def _show(title: str, samples: Sequence[Sample], model: ErrorModel) -> None:
     print("  vertices  told mm | found mm: 16 %   50 %   84 %   95 %")
     for count, told, *found in reliability(samples, model):
         print(f"  {count:8.0f} {told:8.3f} |       " + " ".join(f"{q:6.3f}" for q in found))
-    for limit in (0.7, 0.8, FLAG_MM, 1.2, 1.5):
+    for limit in sorted({0.5, 0.6, FLAG_MM, 0.8, 1.0, 1.2}):
         c = flag_count(samples, model, limit)
         print(
             f"  flag above {limit} mm: {c.bad} bad, {c.flagged} flagged, "

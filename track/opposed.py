@@ -44,11 +44,26 @@ class Crossings:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class _Sides:
-    """The triangles of two sides and the vertices they use."""
+class _Half:
+    """The vertices of one side, and the triangles of the other that they may not pass.
 
-    triangles: tuple[Ints32, Ints32]
-    vertices: tuple[Ints, Ints]
+    `sides` (E, 2) are places in `vertices` that are joined by an edge of the mesh, both ways, and
+    `length_mm` (E,) how long it is in the neutral.
+    """
+
+    vertices: Ints
+    opposite: Ints32
+    sides: Ints
+    length_mm: Floats
+
+    def supported(self, depth: Floats) -> Bools:
+        """Where depths (N,) fall off to the neighbours no faster than the surface is long.
+
+        A vertex far behind something amid neighbours that are not has met the wrong surface.
+        """
+        reach = np.zeros(len(depth))
+        np.maximum.at(reach, self.sides[:, 0], depth[self.sides[:, 1]] + self.length_mm)
+        return np.asarray(depth <= reach)
 
 
 class OpposedSurfaces:
@@ -73,15 +88,16 @@ class OpposedSurfaces:
         labels += _touching(neutral, triangles, graph, taken)
         self._triangles, self._count = triangles, len(neutral)
         inner = ~border_vertices(triangles, len(neutral))  # a rim is an edge, not a surface
-        self._sides = [_sides(label * inner, triangles) for label in labels]
-        self._sides = [one for one in self._sides if min(map(len, one.triangles)) > 0]
+        self._halves = [
+            half for label in labels for half in _both_halves(label * inner, triangles, graph)
+        ]
         normals = np.nan_to_num(vertex_normals(neutral, triangles))
-        self._allowed = [_behind(half, neutral, normals, 0.0)[0] for half in self._halves()]
+        self._allowed = [_behind(half, neutral, normals, 0.0)[0] for half in self._halves]
 
     @property
     def vertices(self) -> Ints:
         """The vertices of all sides, ascending."""
-        parts = [part for one in self._sides for part in one.vertices]
+        parts = [half.vertices for half in self._halves]
         return np.unique(np.concatenate([*parts, np.zeros(0, np.int64)]))
 
     def crossings(self, vertices: Floats) -> Crossings:
@@ -99,21 +115,17 @@ class OpposedSurfaces:
         return _joined(
             [
                 _behind(half, vertices, normals, allowed)[1]
-                for half, allowed in zip(self._halves(), self._allowed, strict=True)
+                for half, allowed in zip(self._halves, self._allowed, strict=True)
             ]
         )
 
-    def _halves(self) -> list[tuple[Ints, Ints32]]:
-        """Each side's vertices with the triangles of the side opposite."""
-        return [(one.vertices[k], one.triangles[1 - k]) for one in self._sides for k in range(2)]
-
 
 def _behind(
-    half: tuple[Ints, Ints32], vertices: Floats, normals: Floats, allowed: Floats | float
+    half: _Half, vertices: Floats, normals: Floats, allowed: Floats | float
 ) -> tuple[Floats, Crossings]:
-    """How far some vertices are behind the triangles opposite; those beyond what is allowed."""
-    own, opposite = half
-    used, place = np.unique(opposite, return_inverse=True)
+    """How far a side's vertices are behind the side opposite; those beyond what is allowed."""
+    own = half.vertices
+    used, place = np.unique(half.opposite, return_inverse=True)
     surface = MatchSurface(
         vertices[used], place.reshape(-1, 3).astype(np.int32), normal_mm=_NORMAL_MM
     )
@@ -122,6 +134,7 @@ def _behind(
     beside = np.sqrt(np.maximum(met.distance_mm**2 - depth**2, 0.0))
     behind = (met.cosine > _FACING) & (depth > 0.0) & (depth < _DEEPEST_MM)
     depth = np.where(behind & (beside < _SIDEWAYS * depth), depth, 0.0)
+    depth = np.where(half.supported(depth), depth, 0.0)
     beyond = depth - allowed
     hit = np.flatnonzero(beyond > 0.0)
     return depth, Crossings(
@@ -219,10 +232,16 @@ def _two_sides(opposite: sparse.csr_matrix, beside: sparse.csr_matrix) -> Floats
     return sides
 
 
-def _sides(label: Ints, triangles: Ints32) -> _Sides:
-    first = triangles[(label[triangles] == 1).all(axis=1)]
-    second = triangles[(label[triangles] == -1).all(axis=1)]
-    return _Sides(
-        triangles=(first, second),
-        vertices=(np.unique(first).astype(np.int64), np.unique(second).astype(np.int64)),
-    )
+def _both_halves(label: Ints, triangles: Ints32, graph: sparse.csr_matrix) -> list[_Half]:
+    """The two halves of a pair of sides; none when a side has no triangle."""
+    sides = [triangles[(label[triangles] == sign).all(axis=1)] for sign in (1, -1)]
+    if min(map(len, sides)) == 0:
+        return []
+    out = []
+    for own, opposite in (sides, sides[::-1]):
+        used = np.unique(own).astype(np.int64)
+        edges = sparse.coo_matrix(graph[used][:, used])
+        pairs = np.stack([edges.row, edges.col], axis=1).astype(np.int64)
+        half = _Half(vertices=used, opposite=opposite, sides=pairs, length_mm=edges.data)
+        out.append(half)
+    return out

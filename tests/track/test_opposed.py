@@ -43,3 +43,10 @@ def test_lids_that_cross_are_found_and_an_open_eye_is_not() -> None:
     surfaces = OpposedSurfaces(vertices, triangles)
     assert len(surfaces.crossings(lid_down(vertices, 6.0)).vertex) == 0
     assert len(surfaces.crossings(lid_down(vertices, 9.5)).vertex) > 3
+
+
+def test_a_lone_vertex_far_behind_is_not_believed() -> None:
+    vertices, triangles, upper = lips(GAP_MM)
+    spiked = vertices.copy()
+    spiked[np.argmin(np.where(upper, vertices[:, 1], np.inf)), 1] -= 2.5
+    assert len(OpposedSurfaces(vertices, triangles).crossings(spiked).vertex) == 0

@@ -5,14 +5,14 @@
 
 Lee Perry-Smith's scan under its photograph (`tools.bench.scan_takes`), moved by expressions of the
 ICT face: its mean head is registered to the scan from hand marks, and each place of the scan takes
-the motion of the nearest skin that looks the same way, smoothed over some millimetres. Expressions
-come and go by sin^2 and the head moves as in `render_take.py`. The scan's lips are one surface: a
-jaw that opens wide would stretch the line between them.
+the motion of the nearest skin that looks the same way, smoothed along the surface over some
+millimetres. So its lips part, over the inside of the mouth that the scan has; its eyes are closed.
+Expressions come and go by sin^2 and the head moves as in `render_take.py`.
 
 OUT gets cameras.json, `<camera>/0000.png` ..., neutral.obj and truth.npz with vertices (F, V, 3),
-faces and face_region, so that score_track.py works on it. The mesh is the scan's own, before the
-ears and down the neck, with its long edges halved: every vertex lies on the drawn surface in every
-frame, so its place is known exactly.
+faces and face_region, so that score_track.py works on it. The mesh is the scan's own outer one,
+before the ears and down the neck, with its long edges halved: every vertex lies on the drawn
+surface in every frame, so its place is known exactly.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ import cv2
 import numpy as np
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+from scipy.sparse.linalg import splu
 
 from capture.archive import read_archive, write_archive
 from capture.arrays import Floats, Floats32, Ints, Ints32
@@ -42,6 +42,7 @@ from track.landmark_file import Landmarks
 from track.neutral import NeutralSettings, fit_template
 from track.rigid import fit_similarity
 from track.surface_match import MatchSurface
+from track.visibility import around, count_views
 
 DEFAULT = "mouthSmile_L:0.9,mouthSmile_R:0.7,cheekPuff_L:0.7,browInnerUp_L:0.9,noseSneer_R:0.8"
 _HEAD, _HEAD_POLYGONS, _NARROW = 11248, 11144, 6706  # of the ICT head: vertices, quads, face
@@ -57,6 +58,7 @@ _MARKS = {  # ICT vertex: where the scan shows it, world mm, by eye from a front
 _NEAR_MM, _FAR_MM = 8.0, 30.0  # whole motion up to here from the ICT skin, none from there on
 _ALIKE = 0.4  # least cosine between the scan's normal and that of the skin it follows
 _NORMAL_MM, _SMOOTH_MM = 12.0, 3.0
+_RINGS = 2
 _EDGE_MM = 6.0  # longer edges of the tracked mesh are halved
 _SLIVER_MM2 = 0.01
 _MARGIN_MM = np.array([1.0, 25.0, 20.0])  # the tracked mesh goes beyond the face by this
@@ -123,13 +125,10 @@ def carried_motion(laid: Mesh, deltas: Floats, places: Floats, triangles: Ints32
     far = np.clip((met.distance_mm - _NEAR_MM) / (_FAR_MM - _NEAR_MM), 0.0, 1.0)
     fade = 1.0 - far * far * (3.0 - 2.0 * far)
     told = np.where((met.cosine > _ALIKE) | (far >= 1.0), 1.0, 1e-3)
-    tree = cKDTree(places)
-    near = tree.sparse_distance_matrix(tree, 3.0 * _SMOOTH_MM, output_type="coo_matrix")
-    values = np.exp(-0.5 * (near.data / _SMOOTH_MM) ** 2)
-    kernel = sparse.csr_matrix((values, (near.row, near.col)), near.shape)
-    kernel.setdiag(1.0)
-    smooth: Floats = np.asarray(kernel @ ((told * fade)[:, None] * moved))
-    smooth /= (kernel @ told)[:, None]
+    stiff, mass = _cotangents(places, triangles)
+    trust = mass * told
+    system = sparse.csc_matrix(sparse.diags(trust) + _SMOOTH_MM**2 * stiff)
+    smooth: Floats = splu(system).solve((trust * fade)[:, None] * moved)
     return smooth
 
 
@@ -141,10 +140,14 @@ def head_motion_at(phase: float, strength: float) -> Pose:
 
 
 def tracked_mesh(places: Floats, triangles: Ints32) -> TrackedMesh:
-    """The surface (P, 3), (T, 3) before the ears, its long edges halved until none is left."""
+    """The outer surface of (P, 3), (T, 3) before the ears, with all of its long edges halved."""
     face = face_region(places)
     low, high = places[face].min(axis=0), places[face].max(axis=0)
     inside = (places > low - _MARGIN_MM).all(axis=1) & (places < high + _MARGIN_MM).all(axis=1)
+    outer = count_views(places, triangles, around(places)) > 0
+    for _ in range(_RINGS):  # the rims of what is open only while the face moves
+        outer[triangles[outer[triangles].any(axis=1)]] = True
+    inside &= outer
     kept = _joined_on(places, triangles[inside[triangles].all(axis=1)])
     used, compact = np.unique(kept, return_inverse=True)
     faces = compact.reshape(-1, 3).astype(np.int32)
@@ -268,6 +271,25 @@ def _joined_on(places: Floats, triangles: Ints32) -> Ints32:
     piece = connected_components(graph, directed=False)[1][whole[:, 0]]
     joined: Ints32 = whole[piece == np.bincount(piece).argmax()]
     return joined
+
+
+def _cotangents(places: Floats, triangles: Ints32) -> tuple[sparse.csr_matrix, Floats]:
+    """Stiffness (P, P) of the surface, negative cotangents left out, and its mass (P,), mm^2."""
+    count = len(places)
+    mass = np.full(count, 1e-6)
+    ends, weights = [], []
+    for k in range(3):
+        a, b, c = (triangles[:, (k + turn) % 3] for turn in range(3))
+        one, other = places[a] - places[c], places[b] - places[c]
+        double = np.linalg.norm(np.cross(one, other), axis=1)
+        mass += np.bincount(c, double / 6.0, minlength=count)
+        weights += [0.5 * np.clip((one * other).sum(axis=1) / np.maximum(double, 1e-9), 0.0, 10.0)]
+        ends += [np.stack([a, b])]
+    both = np.concatenate(ends, axis=1)
+    half = sparse.coo_matrix((np.concatenate(weights), both), (count, count))
+    pull = sparse.csr_matrix(half + half.T)
+    total = np.asarray(pull.sum(axis=1)).ravel()
+    return sparse.csr_matrix(sparse.diags(total) - pull), mass
 
 
 def _halved(vertices: Floats, triangles: Ints32) -> tuple[Ints, Ints32]:

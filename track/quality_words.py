@@ -31,8 +31,9 @@ class ViewHabits:
         names: of the views.
         correlation: (C,) median over frames of its mean NCC; NaN of a view without frames.
         agreed: (C,) median share of its believed matches that agree with the others.
-        lag_frames: (C,) how many frames its pictures are behind the others', estimated from the
-            side to which its matches fall; NaN where the skin hardly moves.
+        lag_frames: (C,) how many frames its pictures are behind the others', told from the side
+            to which its matches fall; a lower bound, as matches are believed within a few pixels
+            only. NaN where the skin hardly moves.
     """
 
     names: tuple[str, ...]
@@ -90,7 +91,7 @@ def take_words(habits: ViewHabits) -> list[str]:
     for name, agreed, lag in zip(habits.names, habits.agreed, habits.lag_frames, strict=True):
         if np.isfinite(lag) and abs(lag) > _LAG_FRAMES and agreed < usual - 0.5 * _APART:
             when = "late" if lag > 0 else "early"
-            words.append(f"{name} is about {abs(lag):.1f} frames {when} against the others")
+            words.append(f"{name} is {when} against the others, by {abs(lag):.1f} frames or more")
         elif np.isfinite(agreed) and agreed < usual - _APART:
             words.append(
                 f"{name} disagrees with the others: {_percent(agreed)} of its matches fit theirs, "

@@ -272,4 +272,4 @@ def test_a_late_view_is_told_by_its_lag() -> None:
     habits = view_habits(list(cameras), performance.vertices, evidence)
     assert habits.lag_frames[3] == pytest.approx(1.0, abs=0.05)
     assert np.abs(np.delete(habits.lag_frames, 3)).max() < 0.05
-    assert take_words(habits) == ["cam03 is about 1.0 frames late against the others"]
+    assert take_words(habits) == ["cam03 is late against the others, by 1.0 frames or more"]

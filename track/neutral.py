@@ -31,9 +31,13 @@ from recon.mesh import Mesh, read_obj, write_obj
 from recon.scan import load_scan, reconstruct
 from recon.surface import Scan
 from track.appearance import bake_appearance
+from track.face_landmarks import LandmarkDetector
 from track.landmark_file import Landmarks, read_landmarks
+from track.landmark_map import LandmarkMap
+from track.landmark_place import DetectedPlace, place_detected
 from track.nonrigid import Fit, NonrigidFit, Step
 from track.placement import Placement, Placer, Viewpoint, place_by_landmarks
+from track.rigid import Similarity
 
 _SIZE_MM = (80.0, 600.0)  # the largest side of a face or a head with neck and shoulders
 _UNITS = ((1000.0, "metres"), (10.0, "centimetres"), (25.4, "inches"), (0.001, "micrometres"))
@@ -98,6 +102,19 @@ class NeutralSettings:
         ]
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Detected:
+    """How the template's place is to be detected.
+
+    Attributes:
+        detector: of landmarks in the first frame.
+        where: the same landmarks on the template.
+    """
+
+    detector: LandmarkDetector
+    where: LandmarkMap
+
+
 def register_neutral(
     take: Take,
     template: Mesh,
@@ -105,6 +122,7 @@ def register_neutral(
     out: Path,
     *,
     landmarks: Path | None = None,
+    detected: Detected | None = None,
     progress: Progress = silent,
 ) -> Mesh:
     """Register a template face mesh, placed or not, to the actor at the first frame of a take.
@@ -122,6 +140,8 @@ def register_neutral(
         out: the OBJ to write.
         landmarks: hand marks (`track.landmark_file.read_landmarks`); they place the template when
             there are three or more, and guide it in any case.
+        detected: a detector, and the template's landmarks: what it finds in the first frame is one
+            more place to try.
         progress: told after each step.
 
     Returns:
@@ -143,12 +163,19 @@ def register_neutral(
         "scan": hash_file(scan_path),
         "template": _mesh_hash(template),
         "landmarks": "none" if landmarks is None else hash_file(landmarks),
+        "detector": "none" if detected is None else type(detected.detector).__name__,
     }
     record = stage_record("neutral", settings, inputs)
     if is_current(out, record):
         return read_obj(out)
     scan = load_scan(scan_path)
-    mesh, report, fit = fit_template(template, scan, cameras, settings, marks, progress=progress)
+    place = None if detected is None else _detected_place(take, template, detected)
+    hint = None if place is None else place.world_from_template
+    mesh, report, fit = fit_template(
+        template, scan, cameras, settings, marks, hint=hint, progress=progress
+    )
+    if place is not None:
+        report["detected"] = dict(place.report)
     with replacing(out.with_suffix(".report.json")) as partial:
         partial.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
     residual = np.nan_to_num(fit.residual_mm, nan=-1.0).astype(np.float32)
@@ -166,6 +193,7 @@ def fit_template(
     settings: NeutralSettings,
     landmarks: Landmarks | None = None,
     *,
+    hint: Similarity | None = None,
     progress: Progress = silent,
 ) -> tuple[Mesh, dict[str, Any], Fit]:
     """Place a template on a scan and register it; the stage without its files.
@@ -175,7 +203,7 @@ def fit_template(
     """
     view = viewpoint(cameras, scan.vertices.astype(np.float64))
     progress(0, settings.steps, "place")
-    placement = _place(template, scan, view, landmarks)
+    placement = _place(template, scan, view, landmarks, hint)
     placed = placement.world_from_template.apply(template.vertices)
     fitter = NonrigidFit(template.triangles, scan, view.eyes)
     fit = fitter.run(placed, settings.schedule(), landmarks, progress=progress)
@@ -218,13 +246,19 @@ def viewpoint(cameras: CameraArray, points: Floats) -> Viewpoint:
     return Viewpoint(eyes=eyes, forward=forward, up=up / np.linalg.norm(up))
 
 
-def _place(template: Mesh, scan: Scan, view: Viewpoint, landmarks: Landmarks | None) -> Placement:
+def _place(
+    template: Mesh,
+    scan: Scan,
+    view: Viewpoint,
+    landmarks: Landmarks | None,
+    hint: Similarity | None,
+) -> Placement:
     surface = (scan.vertices.astype(np.float64), scan.triangles)
     if landmarks is not None and len(landmarks.vertices) >= 3:
         marked = template.vertices[landmarks.vertices]
         motion = place_by_landmarks(marked, landmarks.positions)
         return Placement(world_from_template=motion, score_mm=float("nan"))
-    return Placer((template.vertices, template.triangles), surface, view).search()
+    return Placer((template.vertices, template.triangles), surface, view).search(hint)
 
 
 def _appearance(take: Take, mesh: Mesh) -> dict[str, NDArray[Any]]:
@@ -235,6 +269,14 @@ def _appearance(take: Take, mesh: Mesh) -> dict[str, NDArray[Any]]:
     grey = bake_appearance(mesh.vertices, mesh.triangles, cameras, images)
     names = np.array(list(cameras))
     return {"grey": np.nan_to_num(grey, nan=-1.0), "camera_names": names}
+
+
+def _detected_place(take: Take, template: Mesh, detected: Detected) -> DetectedPlace:
+    frame = take.frames[0]
+    images = {n: take.image(n, frame) for n in take.device_names if take.present(n, frame)}
+    return place_detected(
+        detected.detector, images, take.cameras(), template.vertices, detected.where
+    )
 
 
 def _scan_path(take: Take, progress: Progress) -> Path:

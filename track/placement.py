@@ -67,8 +67,11 @@ class Placer:
         self._template_at = _oriented(*template, outer)
         self._scan_at = _oriented(*scan, every)
 
-    def search(self) -> Placement:
+    def search(self, hint: Similarity | None = None) -> Placement:
         """Try the given place and all upright and turned ones; return the best, refined.
+
+        Args:
+            hint: another place to try, where landmarks were detected say.
 
         Raises:
             SolveError: when no start overlaps the scan.
@@ -78,6 +81,8 @@ class Placer:
         rough = self._best([self.refine(p.world_from_template, 4, 250) for p in first], 6)
         tilted = [self._tilt(rough[0], yaw, pitch) for yaw, pitch in product(_TILTS, _TILTS)]
         rough += [self.refine(start, 6, 250) for start in tilted]
+        if hint is not None:
+            rough.append(self.refine(hint, 6, 250))
         fine = self._best([self.refine(p.world_from_template, 10, 600) for p in rough], 2)
         final = [self.refine(p.world_from_template, 25, 2500) for p in fine]
         return self._best(final, 1)[0]

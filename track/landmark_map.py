@@ -19,6 +19,7 @@ from track.face_landmarks import LANDMARK_NAMES, LANDMARKS
 from track.surface_match import MatchSurface
 from track.surface_samples import SurfaceSamples
 
+_ABSENT = "no such landmark map; docs/landmarks.md tells what it holds, --map names another"
 _NORMAL_MM = 5.0  # what a unit of normal difference counts: the other lip lies near
 
 
@@ -107,7 +108,7 @@ def read_landmark_map(path: Path, mesh: Mesh) -> LandmarkMap:
     Raises:
         TakeError: listing what does not fit, by its place in the file.
     """
-    document = read_json(path, TakeError, absent="no such landmark map")
+    document = read_json(path, TakeError, absent=_ABSENT)
     problems: list[str] = []
     found = parse_landmark_map(document, mesh, problems)
     if not problems and not found.names:

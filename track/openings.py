@@ -9,6 +9,7 @@ from scipy import sparse
 from scipy.sparse import csgraph
 
 from capture.arrays import Floats, Ints, Ints32, check_shape
+from capture.errors import ShapeError
 
 _LONGEST_MM = 300.0  # a rim: more is the edge of the mesh, a neck say
 _FEWEST = 8  # edges of a rim: fewer is a fault of the mesh
@@ -58,7 +59,7 @@ def find_openings(vertices: Floats, triangles: Ints32) -> list[Opening]:
     for n in sorted(range(len(loops)), key=lambda n: (-around[n], int(loops[n].min()))):
         own = int(piece[loops[n][0]])
         if own in edged and len(loops[n]) >= _FEWEST and around[n] <= _LONGEST_MM:
-            out.append(_split(vertices, loops[n]))
+            out.append(split_rim(vertices, loops[n]))
         edged.add(own)
     return out
 
@@ -97,9 +98,23 @@ def _length(points: Floats) -> float:
     return float(np.linalg.norm(points - np.roll(points, 1, axis=0), axis=1).sum())
 
 
-def _split(vertices: Floats, loop: Ints) -> Opening:
-    rim = vertices[loop]
-    apart = np.linalg.norm(rim[:, None] - rim[None], axis=2)
+def split_rim(vertices: Floats, rim: Ints) -> Opening:
+    """Part a rim at its corners, the two vertices that are farthest apart.
+
+    For a margin that is no hole of the mesh, such as that of lids before modelled sockets.
+
+    Args:
+        vertices: (V, 3) mm, of the neutral.
+        rim: (N,) vertices in their order around.
+
+    Raises:
+        ShapeError: when the rim has fewer than eight vertices.
+    """
+    check_shape(vertices=(vertices, "V 3"), rim=(rim, "N"))
+    if len(rim) < _FEWEST:
+        raise ShapeError(f"rim: expected {_FEWEST} vertices or more, found {len(rim)}")
+    place = vertices[rim]
+    apart = np.linalg.norm(place[:, None] - place[None], axis=2)
     one, two = sorted(int(n) for n in np.unravel_index(int(apart.argmax()), apart.shape))
-    back = np.concatenate([loop[two + 1 :], loop[:one]])[::-1]
-    return Opening(corners=loop[[one, two]], first=loop[one + 1 : two], second=back)
+    back = np.concatenate([rim[two + 1 :], rim[:one]])[::-1]
+    return Opening(corners=rim[[one, two]], first=rim[one + 1 : two], second=back)

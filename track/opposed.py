@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -76,12 +77,14 @@ class OpposedSurfaces:
     Args:
         neutral: (V, 3) mm.
         triangles: (T, 3).
+        margins: openings that are no holes of the mesh, see `track.openings.split_rim`.
     """
 
-    def __init__(self, neutral: Floats, triangles: Ints32) -> None:
+    def __init__(self, neutral: Floats, triangles: Ints32, margins: Sequence[Opening] = ()) -> None:
         check_shape(neutral=(neutral, "V 3"), triangles=(triangles, "T 3"))
         graph = _edge_lengths(neutral, triangles)
-        labels = [_beside(opening, neutral, graph) for opening in find_openings(neutral, triangles)]
+        openings = [*find_openings(neutral, triangles), *margins]
+        labels = [_beside(opening, neutral, graph) for opening in openings]
         taken = np.zeros(len(neutral), dtype=np.bool_)
         for label in labels:
             taken |= label != 0

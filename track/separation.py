@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import splu
@@ -9,6 +11,7 @@ from scipy.sparse.linalg import splu
 from capture.arrays import Bools, Floats, Ints, Ints32, check_shape
 from capture.errors import SettingsError
 from track.laplacian import cotangent_laplacian, vertex_areas
+from track.openings import Opening
 from track.opposed import Crossings, OpposedSurfaces
 from track.surface_samples import vertex_rings
 
@@ -32,13 +35,14 @@ class Separation:
     Args:
         neutral: (V, 3) mm.
         triangles: (T, 3).
+        margins: openings that are no holes of the mesh, see `track.openings.split_rim`.
 
     References:
         Nocedal and Wright 2006, "Numerical optimization", Sec. 16.5, for active sets.
     """
 
-    def __init__(self, neutral: Floats, triangles: Ints32) -> None:
-        self._surfaces = OpposedSurfaces(neutral, triangles)
+    def __init__(self, neutral: Floats, triangles: Ints32, margins: Sequence[Opening] = ()) -> None:
+        self._surfaces = OpposedSurfaces(neutral, triangles, margins)
         self._region = _grown(self._surfaces.vertices, triangles, len(neutral))
         area = vertex_areas(neutral, triangles)
         area = np.maximum(area, 0.05 * area[area > 0].mean()) if (area > 0).any() else area + 1.0

@@ -1,7 +1,9 @@
 import numpy as np
+import pytest
 
+from capture.errors import ShapeError
 from tests.track.flaps import eye, lips
-from track.openings import find_openings
+from track.openings import find_openings, split_rim
 
 
 def test_an_almond_has_two_corners_and_two_rims() -> None:
@@ -24,3 +26,9 @@ def test_the_edges_of_pieces_are_no_openings() -> None:
     vertices, triangles = eye(10.0)
     assert find_openings(vertices * 20.0, triangles) == []  # 300 mm and more: a neck
     assert find_openings(vertices, triangles[:0]) == []
+
+
+def test_a_rim_of_few_vertices_is_refused() -> None:
+    vertices, _ = eye(10.0)
+    with pytest.raises(ShapeError, match="rim: expected 8 vertices or more, found 5"):
+        split_rim(vertices, np.arange(5))

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from tests.track.flaps import GAP_MM, closed, eye, lid_down, lips
+from track.openings import split_rim
 from track.opposed import OpposedSurfaces
 from track.rigid import nearest_rotations
 
@@ -50,3 +51,16 @@ def test_a_lone_vertex_far_behind_is_not_believed() -> None:
     spiked = vertices.copy()
     spiked[np.argmin(np.where(upper, vertices[:, 1], np.inf)), 1] -= 2.5
     assert len(OpposedSurfaces(vertices, triangles).crossings(spiked).vertex) == 0
+
+
+def test_lids_before_a_socket_are_known_by_their_margin() -> None:
+    vertices, triangles = eye(8.0)
+    socket = np.array([[0.0, 0.0, -20.0]])
+    ring = np.arange(48)
+    bag = np.stack([np.full(48, len(vertices)), ring, (ring + 1) % 48], axis=1)
+    whole = np.concatenate([triangles, bag]).astype(np.int32)
+    place = np.concatenate([vertices, socket])
+    assert len(OpposedSurfaces(place, whole).vertices) == 0
+    surfaces = OpposedSurfaces(place, whole, [split_rim(place, 48 * 5 + ring)])
+    closed_lid = np.concatenate([lid_down(vertices, 9.5), socket])
+    assert len(surfaces.crossings(closed_lid).vertex) > 3

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from capture.errors import SettingsError
+from tests.track.face_scene import TEMPLATE, head
 from tests.track.flaps import GAP_MM, closed, eye, lid_down, lips
 from track.separation import Separation
 
@@ -49,3 +50,11 @@ def test_lids_are_parted_too() -> None:
     before = separation.surfaces.crossings(crossed).depth_mm.max()
     parted = separation.parted(crossed, np.ones(len(vertices)), rounds=4)
     assert separation.surfaces.crossings(parted).depth_mm.max(initial=0.0) < 0.2 * before
+
+
+def test_a_mesh_without_lips_or_lids_is_left_alone() -> None:
+    mesh = head(TEMPLATE)
+    separation = Separation(mesh.vertices, mesh.triangles)
+    assert len(separation.surfaces.vertices) == 0
+    crumpled = mesh.vertices + np.random.default_rng(1).normal(0.0, 3.0, mesh.vertices.shape)
+    assert separation.parted(crumpled, np.ones(len(crumpled))) is crumpled

@@ -30,8 +30,8 @@ _TAIL = 0.95  # share of seen skin whose error is below a frame's likely error
 _TINY_MM = 1e-4
 _LARGEST_MM = 30.0  # skin farther off is lost, by however much
 TERMS = (
-    "triangulation", "reprojection", "motion", "motion_around", "misfit", "doubt_around",
-    "carried", "reach", "deformation",
+    "triangulation", "reprojection", "motion_around", "misfit", "doubt_around", "carried",
+    "reach", "deformation",
 )  # fmt: skip
 
 
@@ -73,9 +73,9 @@ class Terms:
 
 # Fitted by tools/bench/fit_error_model.py; docs/tracking_quality.md tells on which takes.
 FITTED = ErrorModel(
-    shares=(0.0405, 0.2092, 0.154, 0.7427, 0.4856, 0.0083, 0.8482, 0.0037, 0.0025),
-    haste=2.0243,
-    spread=0.613,
+    shares=(0.0251, 0.4245, 0.6887, 0.5622, 0.0072, 0.9268, 0.002, 0.0023),
+    haste=1.7975,
+    spread=0.621,
 )
 
 
@@ -118,7 +118,7 @@ def error_terms(
 
         triangulation  standard deviation along an axis, from windows, correlation and angles
         reprojection   distance of agreeing matches from the mesh
-        motion         what the last round still found to move; motion_around: in the mean around
+        motion_around  what the last round still found to move, in the mean around
         misfit         how far the mesh stayed from the triangulated points
         doubt_around   share of the views that see it and do not agree, in the mean around, times
                        the deformation
@@ -142,7 +142,6 @@ def error_terms(
     rows = {
         "triangulation": np.where(told.information > 0, sure**-0.5, 0.0),
         "reprojection": told.reprojection_px * mm_per_px,
-        "motion": moved,
         "motion_around": graph.around(moved, _ROUNDS),
         "misfit": told.misfit_mm,
         "doubt_around": graph.around(doubt, _ROUNDS) * deformed_mm,

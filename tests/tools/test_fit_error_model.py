@@ -15,7 +15,7 @@ from tools.bench.fit_error_model import (
 )
 from track.error_model import TERMS, ErrorModel, Terms, combined
 
-SHARES = (0.3, 0.2, 0.0, 0.7, 0.5, 0.0, 0.8, 0.0, 0.0)
+SHARES = (0.3, 0.2, 0.7, 0.5, 0.0, 0.8, 0.0, 0.0)
 TRUE = ErrorModel(shares=SHARES, haste=1.5, spread=0.5)
 
 

@@ -32,6 +32,7 @@ bench: setup ## every benchmark; those on real takes want the folder SHARED
 	$(PYTHON) -m tools.bench.bench_mcap
 	$(PYTHON) -m tools.bench.bench_rig
 	$(PYTHON) -m tools.bench.bench_neutral
+	$(PYTHON) -m tools.bench.bench_landmarks $(SHARED)/takes/dev-smile --frames 0 3 6 11
 	$(PYTHON) -m tools.bench.bench_stereo $(SHARED)/takes/dev-smile 0 --score $(SHARED)/tools/score_scan.py
 	$(PYTHON) -m tools.bench.bench_track $(SHARED)/takes/dev-smile --score $(SHARED)/tools/score_track.py \
 		--cases default opponent --faults ""

@@ -136,10 +136,10 @@ def _moves(local: Floats) -> dict[str, Floats]:
         lids = 36 if side == "right" else 42
         brow = [17, 18, 19, 20, 21] if side == "right" else [26, 25, 24, 23, 22]  # from outside
         pull = {corner: 1.0, inner: 0.9, beside[0]: 0.5, beside[1]: 0.5}
-        add(f"smile_{side}", {k: (sign * 7.0 * w, 6.0 * w, -4.0 * w) for k, w in pull.items()})
+        add(f"smile_{side}", {k: (sign * 10.0 * w, 8.0 * w, -7.0 * w) for k, w in pull.items()})
         add(f"frown_{side}", {k: (sign * 2.0 * w, -6.0 * w, -2.0 * w) for k, w in pull.items()})
         gap = [local[lids + 5] - local[lids + 1], local[lids + 4] - local[lids + 2]]
-        close = {lids + 1 + k: tuple((0.95 * gap[k]).tolist()) for k in range(2)}
+        close = {lids + 1 + k: tuple(gap[k].tolist()) for k in range(2)}
         add(f"blink_{side}", {k: (m[0], m[1], m[2]) for k, m in close.items()})
         add(f"wide_{side}", {lids + 1 + k: (0.0, 2.0, 0.0) for k in range(2)})
         add(f"squint_{side}", {lids + 4 + k: (0.0, 2.0, 0.0) for k in range(2)})

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +18,11 @@ from track.landmark_dlib import Gray
 from track.landmark_map import LandmarkMap
 from track.raster import RasterBuffers
 
-_OFTEN = ("jaw_open", "jawOpen")  # in half of the moments: nothing else moves as far
+_OFTEN = {"jaw_open": (0.6, 1.3), "jawOpen": (0.6, 1.3), "blink": (0.35, 1.0),
+          "eyeBlink": (0.35, 1.0), "smile": (0.3, 1.2), "mouthSmile": (0.3, 1.2)}  # fmt: skip
+_SIDES = ("_right", "_left", "_R", "_L", "Right", "Left")
+_OPPOSED = ("mouth", "jaw")  # to the left and to the right cancel each other
+_BOTH = 0.7  # of the moments in which a pair moves, both sides move alike
 _HIDDEN_MM = 7.0  # a landmark this far behind what its pixel shows is not to be seen in the view
 
 
@@ -70,7 +74,7 @@ class Sheet:
 def made_up_acts(
     mesh: Mesh, shapes: Mapping[str, Floats], count: int, jitter: Jitter, seed: int
 ) -> list[Act]:
-    """The neutral, then moments of up to four mixed expressions and a head that turns.
+    """The neutral, then moments of a few mixed expressions and a head that turns.
 
     Args:
         mesh: the neutral, world mm.
@@ -80,16 +84,13 @@ def made_up_acts(
         seed: of all that is drawn.
     """
     rng = np.random.default_rng(seed)
-    names = sorted(shapes)
+    pairs = _pairs(shapes)
     middle = mesh.vertices.mean(axis=0)
     out = [Act(vertices=mesh.vertices, head=np.eye(4))]
     while len(out) < count:
         moved = mesh.vertices.copy()
-        wide = rng.uniform(0.0, 1.3) if rng.uniform() < 0.6 else 0.0
-        for name in (name for name in names if name in _OFTEN):
-            moved += float(wide) * shapes[name]
-        for name in rng.choice(names, min(int(rng.integers(1, 5)), len(names)), replace=False):
-            moved += float(rng.uniform(0.2, 1.0)) * shapes[name]
+        for name, weight in _mixed(pairs, rng).items():
+            moved += weight * shapes[name]
         turn = Pose.from_rotation_vector(
             np.radians(jitter.turn_deg) * rng.normal(size=3), np.zeros(3)
         ).rotation
@@ -97,6 +98,32 @@ def made_up_acts(
         head[:3, :3] = turn
         head[:3, 3] = middle - turn @ middle + jitter.shift_mm * rng.normal(size=3)
         out.append(Act(vertices=moved @ turn.T + head[:3, 3], head=head))
+    return out
+
+
+def _pairs(names: Iterable[str]) -> dict[str, list[str]]:
+    """Expressions by their name without a side: two sides, or one alone."""
+    out: dict[str, list[str]] = {}
+    for name in sorted(names):
+        side = next((side for side in _SIDES if name.endswith(side)), "")
+        stem = name.removesuffix(side)
+        out.setdefault(name if stem in _OPPOSED else stem, []).append(name)
+    return out
+
+
+def _mixed(pairs: Mapping[str, list[str]], rng: np.random.Generator) -> dict[str, float]:
+    """Weights of some expressions: those that move far more often than the rest."""
+    stems = list(pairs)
+    some = rng.choice(stems, min(int(rng.integers(0, 4)), len(stems)), replace=False).tolist()
+    sizes = {stem: float(rng.uniform(0.2, 1.0)) for stem in some}
+    for stem, (share, most) in _OFTEN.items():
+        if stem in pairs and rng.uniform() < share:
+            sizes[stem] = float(rng.uniform(0.0, most))
+    out: dict[str, float] = {}
+    for stem, size in sizes.items():
+        alike = rng.uniform() < _BOTH
+        parts = np.ones(len(pairs[stem])) if alike else rng.uniform(0.0, 1.0, len(pairs[stem]))
+        out.update(zip(pairs[stem], (size * parts).tolist(), strict=True))
     return out
 
 

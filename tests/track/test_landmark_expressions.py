@@ -8,6 +8,7 @@ from tests.track.landmark_face import face, face_map
 from track.face_landmarks import LANDMARK_NAMES
 from track.landmark_actor import landmark_rest
 from track.landmark_expressions import head_frame, landmark_shapes
+from track.landmark_training import Jitter, made_up_acts
 
 MESH = face()
 WHERE = face_map(MESH)
@@ -42,3 +43,18 @@ def test_a_map_without_lips_is_refused() -> None:
     known = [name for name in LANDMARK_NAMES if not name.startswith("lip")]
     with pytest.raises(TakeError, match=r"expressions need lids_right_0.*lip_outer_6 on the mesh"):
         landmark_shapes(MESH, WHERE.select(known))
+
+
+def test_moments_mix_sides_and_repeat() -> None:
+    shapes = {name: np.full((len(MESH.vertices), 3), 1.0) for name in
+              ("blink_left", "blink_right", "jaw_open", "mouth_left", "mouth_right")}  # fmt: skip
+    jitter = Jitter(turn_deg=0.0, shift_mm=0.0)
+    acts = made_up_acts(MESH, shapes, 40, jitter, seed=3)
+    again = made_up_acts(MESH, shapes, 40, jitter, seed=3)
+    assert all(np.array_equal(a.vertices, b.vertices) for a, b in zip(acts, again, strict=True))
+    assert np.array_equal(acts[0].vertices, MESH.vertices)
+    sizes = [float((act.vertices - MESH.vertices).mean()) for act in acts]
+    assert len(np.unique(np.round(sizes, 6))) > 25
+    assert np.abs(acts[5].head - np.eye(4)).max() < 1e-9
+    turned = made_up_acts(MESH, shapes, 10, Jitter(turn_deg=5.0), seed=3)
+    assert np.abs(turned[3].head[:3, :3] - np.eye(3)).max() > 0.01

@@ -2,15 +2,17 @@
 
 Example: python -m tools.bench.bench_landmarks SRC --take TAKE --frames 0 6 12
 
-SRC is a visiting take with neutral.obj and truth.npz; TAKE, the same imported, is made beside it
-when it is not there. The generic model is measured where the extra `landmarks` is installed.
+SRC is a visiting take with neutral.obj and truth.npz; TAKE is the same imported, made when it is
+not there, and kept nowhere when it is not given. The generic model is measured where the extra
+`landmarks` is installed.
 """
 
 from __future__ import annotations
 
 import argparse
+import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -63,13 +65,18 @@ def main() -> None:
     parser.add_argument("--frames", type=int, nargs="+", default=[0])
     parser.add_argument("--pictures", type=int, default=LandmarkSettings().pictures)
     options = parser.parse_args()
-    folder = options.take or options.source.with_name(options.source.name + ".take")
-    take = Take.open(folder) if folder.is_dir() else import_take(options.source, folder)
-    with np.load(options.source / "truth.npz") as data:
-        ids, truth = data["landmarks68"], data["vertices"][options.frames].astype(np.float64)
-    mesh = read_obj(options.source / "neutral.obj")
-    where = vertex_map(dict(zip(LANDMARK_NAMES, ids.tolist(), strict=True)), mesh.triangles)
     settings = LandmarkSettings(pictures=options.pictures)
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = options.take or Path(scratch) / "take"
+        take = Take.open(folder) if folder.is_dir() else import_take(options.source, folder)
+        _measure(take, options.source, settings, options.frames)
+
+
+def _measure(take: Take, source: Path, settings: LandmarkSettings, frames: Sequence[int]) -> None:
+    with np.load(source / "truth.npz") as data:
+        ids, truth = data["landmarks68"], data["vertices"][frames].astype(np.float64)
+    mesh = read_obj(source / "neutral.obj")
+    where = vertex_map(dict(zip(LANDMARK_NAMES, ids.tolist(), strict=True)), mesh.triangles)
     began = time.process_time()
     detector = train_landmarks(take, mesh, where, settings)
     files = list((take.products / "landmarks" / "predictor").glob("*.dat"))
@@ -78,16 +85,19 @@ def main() -> None:
     print(f"trained {len(files)} predictors: {size:.1f} MB, {spent:.0f} CPU s")
     print("by region: median and worst, mm, of the landmarks met over the views")
     head: Floats | None = None
-    for frame, now in zip(options.frames, truth, strict=True):
+    for frame, now in zip(frames, truth, strict=True):
         images = {name: take.image(name, frame) for name in take.device_names}
         began = time.process_time()
         found = detector.detect_frame(images, head, settings.passes)
         spent, head = time.process_time() - began, found.head
         middle, share = pixel_errors(found.detections, take.cameras(), now[ids])
-        print(f"frame {frame:3d}  actor's  {regions_mm(found.points.positions, now[ids])}  "
-              f"{middle:.2f} px, {share:.2f} of what it says, {spent:.2f} CPU s",
-              flush=True)  # fmt: skip
-    _generic(take, images, truth[-1][ids], options.frames[-1])
+        told = regions_mm(found.points.positions, now[ids])
+        print(
+            f"frame {frame:3d}  actor's  {told}  {middle:.2f} px, {share:.2f} of what it says, "
+            f"{spent:.2f} CPU s",
+            flush=True,
+        )
+    _generic(take, images, truth[-1][ids], frames[-1])
 
 
 def _generic(take: Take, images: Mapping[str, Image], truth: Floats, frame: int) -> None:

@@ -27,7 +27,7 @@ from capture.take import Take
 from recon.images import mono
 from recon.mesh import Mesh
 from track.appearance import ActorSkin
-from track.face_landmarks import LANDMARKS, Detection
+from track.face_landmarks import LANDMARK_NAMES, LANDMARKS, Detection, surface_landmarks
 from track.landmark_actor import (
     ActorDetector,
     FrameFound,
@@ -160,6 +160,8 @@ def detect_landmarks(
 ) -> dict[str, Any]:
     """Find the landmarks of frames and write them where tracking looks for them.
 
+    The jaw's 17 are found, but not told: they lie on smooth skin, and wander over it.
+
     The head is looked for where the frame before has it. A frame whose views do not agree is
     left without landmarks, and the report says why.
 
@@ -175,6 +177,8 @@ def detect_landmarks(
         The report: by frame, how many views and landmarks agree and how well.
     """
     folder = take.products / _FOLDER
+    sure = {LANDMARK_NAMES[index] for index in surface_landmarks().tolist()}
+    told = where.select([name for name in where.names if name in sure])
     head: Floats | None = None
     figures: dict[str, Any] = {}
     for done, frame in enumerate(frames, start=1):
@@ -188,7 +192,7 @@ def detect_landmarks(
             figures[str(frame)] = {"found": False, "why": str(error)}
         else:
             head = found.head
-            figures[str(frame)] = _write_frame(path, frame, found, where)
+            figures[str(frame)] = _write_frame(path, frame, found, told)
         progress(done, len(frames), "landmarks")
     report = {"frames": figures}
     with replacing(folder / "report.json") as partial:

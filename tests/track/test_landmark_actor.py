@@ -76,9 +76,10 @@ def test_landmarks_are_found_where_they_are(take: Take, shapes: dict[str, np.nda
     assert report["frames"]["1"]["found"]
     (sightings,) = stored_sightings(take, MESH, 1)
     lifted = sightings.lifted(MESH.vertices, {camera.name: camera for camera in CAMERAS})
-    there = WHERE.surface.points(MESH.vertices) + lifted.motion
-    sure = (lifted.views >= 2) & (np.arange(68) >= 17)
-    assert np.median(np.linalg.norm(there - truth, axis=1)[sure]) < 2.5
+    there = WHERE.surface.points(MESH.vertices)[17:] + lifted.motion  # all but the jaw
+    sure = lifted.views >= 2
+    assert sure.sum() > 40
+    assert np.median(np.linalg.norm(there - truth[17:], axis=1)[sure]) < 2.5
     assert stored_sightings(take, MESH, 2) == []
     assert stored_hash(take, 2) == "none"
     one = detector.detect(images["cam07"], "cam07")
@@ -92,7 +93,7 @@ def test_landmarks_are_found_where_they_are(take: Take, shapes: dict[str, np.nda
     stamp = (folder / "model.json").stat().st_mtime_ns
     train_landmarks(take, MESH, WHERE, SMALL, shapes=shapes)
     assert (folder / "model.json").stat().st_mtime_ns == stamp  # current: not trained again
-    with pytest.raises(SolveError, match=r"views agree on \d+ of 24 steady landmarks"):
+    with pytest.raises(SolveError, match=r"views agree on \d+ of 23 steady landmarks"):
         detector.detect_frame({name: take.image(name, 2) for name in take.device_names[:1]})
     (folder / "cam07.dat").write_bytes(b"no trees")
     with pytest.raises(TakeError, match=r"cam07\.dat: missing, or not the predictor"):

@@ -7,7 +7,8 @@ frame is followed by `cv2.calcOpticalFlowPyrLK` from the first frame to every ot
 where the last frame had it; a match that does not return to its start is dropped. Vertices are
 triangulated from all views robustly, and one Laplacian solve a frame, reweighted where vertices
 leave it, carries the rest. Windows, limits and stiffness are those of several tried that did best
-on takes/dev-smile; of our tracking it uses the triangulation, the solver and the visibility.
+on takes/dev-smile and the photographed head (`tools.bench.moving_head`); of our tracking it uses
+the triangulation, the solver and the visibility.
 """
 
 from __future__ import annotations
@@ -37,13 +38,13 @@ from track.reference import facing_normals, visible_samples
 from track.surface_samples import sample_surface
 
 Picture = NDArray[np.uint8]
-_WINDOW, _LEVELS = (11, 11), 3
+_WINDOW, _LEVELS = (13, 13), 3
 _STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.01)
 _RETURN_PX = 0.3
-_COSINE = 0.5
+_COSINE = 0.35
 _ROUNDS = 3  # of linearising the projection
 _SCALE_PX, _PRIOR_MM = 0.7, 5.0
-_BENDING_MM = 2.0
+_BENDING_MM = 3.0
 _TRUST = np.array([0.0, 0.01, 0.2, 1.0])  # by how many views agree on a vertex; more are as three
 _REWEIGHTED, _AWAY_MM = (
     3,

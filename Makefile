@@ -36,6 +36,7 @@ bench: setup ## every benchmark; those on real takes want the folder SHARED
 	$(PYTHON) -m tools.bench.bench_stereo $(SHARED)/takes/dev-smile 0 --score $(SHARED)/tools/score_scan.py
 	$(PYTHON) -m tools.bench.bench_track $(SHARED)/takes/dev-smile --score $(SHARED)/tools/score_track.py \
 		--cases default opponent --faults ""
+	$(PYTHON) -m tools.bench.bench_flow $(SHARED)/takes/dev-smile --frames 3 6
 	$(PYTHON) -m tools.bench.bench_spine $(SHARED)/takes/dev-smile --shared $(SHARED)
 
 clean: ## remove the environment and what the demo wrote

@@ -16,6 +16,7 @@ from typing import Any
 
 _CHUNK = 1 << 20
 _SEAL = "product_sha256"
+_SOURCES = {".py", ".glsl"}
 _FLOORS = ("capture", "recon", "track", "rig")  # lowest first; names only, nothing is imported
 
 
@@ -137,7 +138,7 @@ def _source_digest(floor: str) -> str:
     digest = hashlib.sha256()
     house = Path(__file__).resolve().parents[1]
     for name in _FLOORS[: _FLOORS.index(floor) + 1]:
-        for path in sorted((house / name).rglob("*.py")):
+        for path in sorted(p for p in (house / name).rglob("*") if p.suffix in _SOURCES):
             digest.update(path.relative_to(house).as_posix().encode() + b"\0")
             digest.update(path.read_bytes())
     return digest.hexdigest()[:12]

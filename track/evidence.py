@@ -7,19 +7,19 @@ others. The error model (`track.error_model`) turns it into millimetres.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from capture.arrays import Floats, Floats32, Ints32, check_shape
+from capture.arrays import Bools, Floats, Floats32, Ints32, check_shape
 from track.guide import GuidedView
-from track.lift import Lifted, Observations
+from track.lift import Lifted, Observations, merged
 from track.reference import ReferenceLevel
 from track.surface_samples import SurfaceSamples
 
 _AGREES_PX = 0.7  # a match no farther than this from the triangulated point agrees with it
 _MEASURED = ("residual_px", "reprojection_px", "correlation", "motion_mm", "misfit_mm")
-_COUNTED = ("views", "views_open", "information", "agreement")
+_COUNTED = ("views", "views_open", "information", "agreement", "leaning")
 _VERTEX = (*_MEASURED, *_COUNTED)
 _TALLIES = ("view_seen", "view_believed", "view_sum", "view_agreed")
 _JUDGED = ("view_correlation", "view_residual_px")
@@ -41,6 +41,7 @@ class FrameEvidence:
         information: (V,) mm^-2 of the triangulation; 0: none.
         agreement: (V,) 0..1, how well the samples fit their neighbours' motions; 0: none.
         motion_mm: (V,) what the last round still found to move: convergence. NaN: not measured.
+        leaning: (V,) 0..1, share of the matches that were to another frame than the neutral.
         misfit_mm: (V,) how far the solved mesh stayed from the triangulated points. NaN likewise.
         view_seen: (C,) samples the view could have matched; 0 for a view without this frame.
         view_believed: (C,) matches that correlated and were near enough.
@@ -61,6 +62,7 @@ class FrameEvidence:
     agreement: Floats32
     motion_mm: Floats32
     misfit_mm: Floats32
+    leaning: Floats32
     view_seen: Floats32
     view_believed: Floats32
     view_sum: Floats32
@@ -103,12 +105,20 @@ class ViewMatches:
         correlation: mean NCC over them; NaN of none.
         observations: its believed matches.
         believed: (L,) the NCC of each of these.
+        second: (L,) whether it was matched to another frame than the neutral.
     """
 
     seen: Ints32
     correlation: float
     observations: Observations
     believed: Floats
+    second: Bools
+
+    def at(self, share: float) -> ViewMatches:
+        """The same of a second reference, at a share of their information."""
+        return replace(
+            self, observations=self.observations.at(share), second=np.ones_like(self.second)
+        )
 
 
 def view_matches(
@@ -125,6 +135,32 @@ def view_matches(
         correlation=float(correlation[tried].mean()) if tried.any() else float("nan"),
         observations=believed,
         believed=correlation[np.searchsorted(level.samples, believed.sample)],
+        second=np.zeros(len(believed.sample), np.bool_),
+    )
+
+
+def preferred(one: ViewMatches, other: ViewMatches, margin: float) -> ViewMatches:
+    """Of a view's matches to two references, sample by sample the first or what beats it.
+
+    Args:
+        one: its matches to the neutral.
+        other: to another frame.
+        margin: by how much the second must correlate more.
+    """
+    count = 1 + max(int(part.observations.sample.max(initial=0)) for part in (one, other))
+    first, second = np.full(count, -1.0), np.full(count, -1.0)
+    first[one.observations.sample] = one.believed
+    second[other.observations.sample] = other.believed
+    wins = second > first + margin
+    parts = []
+    for part, keep in ((one, ~wins), (other, wins)):
+        parts.append((part, np.flatnonzero(keep[part.observations.sample])))
+    return replace(
+        one,
+        seen=np.union1d(one.seen, other.seen).astype(np.int32),
+        observations=merged([part.observations.chosen(kept) for part, kept in parts]),
+        believed=np.concatenate([part.believed[kept] for part, kept in parts]),
+        second=np.concatenate([part.second[kept] for part, kept in parts]),
     )
 
 
@@ -150,11 +186,12 @@ def frame_evidence(
     agreement, moved = solved
     found = lifted.views > 0
     count = len(samples)
-    total, times, able, away, near = np.zeros((5, count))
+    total, times, able, away, near, leaning = np.zeros((6, count))
     for matches in views.values():
         seen = matches.observations
         total += np.bincount(seen.sample, matches.believed, minlength=count)
         times += np.bincount(seen.sample, minlength=count)
+        leaning += np.bincount(seen.sample, matches.second, minlength=count)
         able[matches.seen] += 1.0
         agrees = _distance(seen, lifted.motion) < _AGREES_PX
         away += np.bincount(seen.sample, agrees * _distance(seen, moved), minlength=count)
@@ -174,6 +211,7 @@ def frame_evidence(
         "views_open": able,
         "information": lifted.information,
         "agreement": np.where(found, agreement, 0.0),
+        "leaning": leaning / np.maximum(times, 1.0),
     }
     vertex = {key: _around(samples, value, vertex_count) for key, value in measured.items()}
     vertex |= {

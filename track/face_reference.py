@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from capture.arrays import Floats, Floats32, Ints
+from capture.arrays import Bools, Floats, Floats32, Ints
 from capture.camera import Camera
 from track.pyramid import camera_at_level, image_pyramid
 from track.reference import ReferenceLevel, reference_level, visible_samples
@@ -54,6 +54,7 @@ def face_reference(
     images: Mapping[str, Floats32],
     windows: ReferenceWindows,
     pool: ThreadPoolExecutor,
+    only: Bools | None = None,
 ) -> FaceReference:
     """Build the reference that a frame makes.
 
@@ -64,6 +65,7 @@ def face_reference(
         images: the frame's images, float32 mono, of the views that have one.
         windows: how it is cut.
         pool: threads; the levels of a view are built side by side.
+        only: (N,) which samples are wanted; None: all. A view that sees none of them is left out.
     """
     frame, vertices = placed
     skin = surface.skin(vertices)
@@ -73,11 +75,16 @@ def face_reference(
     seen = np.zeros(len(surface.samples), np.int64)
     for name, image in images.items():
         lenses = [camera_at_level(cameras[name], level) for level in range(windows.levels)]
-        drawn = [surface.raster.render(lens, skin) for lens in lenses]
+        finest = surface.raster.render(lenses[0], skin)
         chosen = visible_samples(
-            surface.samples, skin, facing, cameras[name], drawn[0], windows.min_cosine
+            surface.samples, skin, facing, cameras[name], finest, windows.min_cosine
         )
+        if only is not None:
+            chosen = chosen[only[chosen]]
+        if len(chosen) == 0 and only is not None:
+            continue
         pieces = (surface.triangles, surface.samples.triangle[chosen], surface.rings)
+        drawn = [finest, *(surface.raster.render(lens, skin) for lens in lenses[1:])]
         pixels = [lens.project(points[chosen]) for lens in lenses]
         halves = [windows.half] + [windows.half_coarse] * (windows.levels - 1)
         pyramid = image_pyramid(image, windows.levels)

@@ -38,6 +38,15 @@ class Observations:
             information=(self.information, "L 3"),
         )
 
+    def chosen(self, which: Ints) -> Observations:
+        """Some of them, by index."""
+        return Observations(
+            sample=self.sample[which],
+            offset=self.offset[which],
+            jacobian=self.jacobian[which],
+            information=self.information[which],
+        )
+
     def at(self, share: float) -> Observations:
         """The same at a share of their information."""
         return replace(self, information=share * self.information)

@@ -11,10 +11,11 @@ import numpy as np
 from capture.arrays import Bools, Floats, Floats32, Ints
 from recon.surface import Scan
 from track.beyond import search_beyond
-from track.evidence import ViewMatches, view_matches
+from track.evidence import ViewMatches, preferred, view_matches
 from track.face_reference import FaceReference
-from track.flow import ALIGNED, FlowMatches, better, refine_flow, search_flow
-from track.guide import GuidedView, guided_view
+from track.flow import ALIGNED, FlowMatches, better
+from track.flow_backend import FlowBackend
+from track.guide import GuidedView
 from track.lift import Lifted, Observations, merged, triangulate
 from track.observe import believable, observe
 from track.reference import ReferenceLevel
@@ -24,6 +25,7 @@ from track.surface_model import SurfaceModel
 
 _PRIOR_MM = 1.0
 _FEW = 2  # a sample that no more views than this see gets its depth from the scan too
+_MARGIN = 0.1  # of correlation, by which a match to the second reference beats one to the neutral
 _SECOND_HAND = 0.25  # information of a match to another frame than the neutral: it has erred itself
 
 
@@ -51,15 +53,19 @@ class Matcher:
 
     Attributes:
         surface: what is tracked.
-        references: the neutral first; the others serve samples that it does not.
+        neutral: what the neutral showed.
+        second: a frame that serves samples which the neutral serves no more, or None.
         min_correlation: least NCC believed.
         pool: threads over the views; the kernels let go of the interpreter.
+        flow: who warps, searches and refines.
     """
 
     surface: SurfaceModel
-    references: Sequence[FaceReference]
+    neutral: FaceReference
+    second: FaceReference | None
     min_correlation: float
     pool: ThreadPoolExecutor
+    flow: FlowBackend
 
     def measure(
         self, step: Step, vertices: Floats, seen: RoundImages
@@ -77,47 +83,55 @@ class Matcher:
         skin = self.surface.skin(vertices)
         points = self.surface.samples.points(skin)
 
-        def measure(name: str) -> list[ViewMatches]:
+        def measure(name: str) -> ViewMatches:
             return self._view(step, name, (skin, points), seen)
 
-        every = list(self.pool.map(measure, seen.views))  # in the order of the views
-        matches = {name: parts[0] for name, parts in zip(seen.views, every, strict=True)}
-        told = [part.observations for parts in every for part in parts]
+        measured = list(self.pool.map(measure, seen.views))  # in the order of the views
+        matches = dict(zip(seen.views, measured, strict=True))
+        told = [part.observations for part in measured]
         if seen.depth is not None:
-            firsthand = {name: parts.observations for name, parts in matches.items()}
-            told += self._depths(seen.depth, firsthand, skin)
+            told += self._depths(seen.depth, dict(zip(seen.views, told, strict=True)), skin)
         lifted = triangulate(merged(told), len(self.surface.samples), step.scale_px, _PRIOR_MM)
         return lifted, matches
 
     def scan_depth(self, scan: Scan, vertices: Floats, agreed: Ints) -> ScanDepth:
         """The scan around samples that few views agreed on (N,), and any view can see."""
-        poor = (self.references[0].seen > 0) & (agreed <= _FEW)
+        poor = (self.neutral.seen > 0) & (agreed <= _FEW)
         return ScanDepth(scan, self.surface.samples.points(self.surface.skin(vertices))[poor])
 
     def _view(
         self, step: Step, name: str, estimate: tuple[Floats, Floats], seen: RoundImages
-    ) -> list[ViewMatches]:
-        """One view matched to the neutral, and what fails there to the other references."""
-        skin, points = estimate
-        image, occluders = seen.views[name], seen.occluders.get(name)
-        out: list[ViewMatches] = []
-        missing: Bools = np.ones(len(points), np.bool_)
-        for reference in self.references:
-            if name not in reference.views:
-                continue
-            level = reference.views[name][step.level]
-            chosen = missing[level.samples] & (level.samples % seen.stride == 0)
-            if out and not chosen.any():
-                continue
-            view = guided_view(level, self.surface.triangles, skin, image, occluders)
-            matches = _match(step, level, (view, image), chosen)
-            believed = believable(matches, self.min_correlation, step.limit_px)
-            told = observe(level, view, matches, points, believed)
-            if reference is not self.references[0]:
-                told = told.at(_SECOND_HAND)
-            out.append(view_matches(level, view, matches.correlation, told))
-            missing[told.sample] = False
-        return out
+    ) -> ViewMatches:
+        """One view matched to the neutral, and to the second reference what fits that better."""
+        matched = self._against(step, self.neutral.views[name], (name, estimate), seen, None)
+        if self.second is None or name not in self.second.views:
+            return matched
+        level = self.second.views[name]
+        known = np.full(len(estimate[1]), -1.0)
+        known[matched.observations.sample] = matched.believed
+        other = self._against(step, level, (name, estimate), seen, known < ALIGNED)
+        return preferred(matched, other.at(_SECOND_HAND), _MARGIN)
+
+    def _against(
+        self,
+        step: Step,
+        levels: Sequence[ReferenceLevel],
+        what: tuple[str, tuple[Floats, Floats]],
+        seen: RoundImages,
+        wanted: Bools | None,
+    ) -> ViewMatches:
+        """One view matched to one reference: all of its samples, or those wanted (N,)."""
+        name, (skin, points) = what
+        level, image = levels[step.level], seen.views[name]
+        chosen = level.samples % seen.stride == 0
+        if wanted is not None:
+            chosen &= wanted[level.samples]
+        hidden = seen.occluders.get(name)
+        view = self.flow.warp(level, self.surface.triangles, skin, image, hidden)
+        matches = self._match(step, level, (view, image), chosen)
+        believed = believable(matches, self.min_correlation, step.limit_px)
+        told = observe(level, view, matches, points, believed)
+        return view_matches(level, view, matches.correlation, told)
 
     def _depths(
         self, depth: ScanDepth, seen: Mapping[str, Observations], skin: Floats
@@ -130,7 +144,7 @@ class Matcher:
         normals = samples.points(self.surface.normals(skin))
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
         estimate = (samples.points(skin), normals)
-        views = self.references[0].views
+        views = self.neutral.views
         return [
             depth_observations(
                 depth, views[name][0].camera, part, times[part.sample] <= _FEW, estimate
@@ -138,14 +152,18 @@ class Matcher:
             for name, part in seen.items()
         ]
 
-
-def _match(
-    step: Step, level: ReferenceLevel, shown: tuple[GuidedView, Floats32], chosen: Bools
-) -> FlowMatches:
-    view, image = shown
-    found = search_flow(level, view, chosen, step.search_px)
-    matches = refine_flow(level, view, found.displacement, step.iterations)
-    lost = chosen & level.at_edge & (matches.correlation < ALIGNED)
-    return better(
-        matches, search_beyond(level, view, image, lost, (step.search_px, step.iterations))
-    )
+    def _match(
+        self,
+        step: Step,
+        level: ReferenceLevel,
+        shown: tuple[GuidedView, Floats32],
+        chosen: Bools,
+    ) -> FlowMatches:
+        view, image = shown
+        found = self.flow.search(level, view, chosen, step.search_px)
+        matches = self.flow.refine(level, view, found.displacement, step.iterations)
+        lost = chosen & level.at_edge & (matches.correlation < ALIGNED)
+        if not lost.any():
+            return matches
+        reach = (step.search_px, step.iterations)
+        return better(matches, search_beyond(level, view, image, lost, reach))

@@ -11,23 +11,24 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import sparse
 
-from capture.arrays import Floats, Floats32, Ints
+from capture.arrays import Bools, Floats, Floats32, Ints
 from capture.camera import Camera
 from capture.errors import SettingsError, SolveError
 from recon.surface import Scan
 from track.evidence import FrameEvidence, frame_evidence
 from track.face_reference import FaceReference, ReferenceWindows, face_reference
+from track.flow_backend import CpuFlow, FlowBackend
 from track.guide import guided_view
 from track.laplacian import Constraints, LaplacianDeformer, Stiffness
 from track.lift import Lifted
 from track.matching import Matcher, RoundImages
 from track.pyramid import image_pyramid
-from track.rigid import fit_similarity
+from track.rigid import Similarity, fit_similarity
 from track.scan_depth import ScanDepth
 from track.schedule import Step
 from track.sightings import Sightings
@@ -37,6 +38,14 @@ from track.surface_model import SurfaceModel
 _SURE = 0.25  # confidence from which a vertex carries its neighbours into the next frame
 _HELD = 0.8  # confidence from which skin is not looked for elsewhere in the next frame
 _SINGLE_VIEW = 0.02  # weight of a sample that one view alone sees, and no scan: of unknown depth
+_HELD_WEIGHT = 0.02  # of every vertex, when what is sighted pulls the mesh
+_PULLS = 3
+_SPANNING = 30  # samples from which a rigid motion is told
+_MOTION_ROUNDS = 8
+_STILL_MM = 0.7  # skin that is this near to where the head carries it has hardly moved in it
+_GONE_MM = 3.0  # what counts for seen skin that is not found where the head carries it
+_UNREST_ROUNDS = 2  # of summing over neighbours: the size of a region
+_ENOUGH = 12  # samples that a mesh is solved for from
 _AGREED = 2  # witnesses, views or a view and the scan, that fix a sample's place
 
 
@@ -52,6 +61,7 @@ class FrameResult:
         residual_px: median distance between matches and the projected lifted points.
         views: mean number of views that agree on a sample.
         evidence: what the last step measured, by vertex and by view.
+        reference: the frame that it was matched to beside the neutral; -1: none.
     """
 
     vertices: Floats
@@ -61,6 +71,7 @@ class FrameResult:
     residual_px: float
     views: float
     evidence: FrameEvidence
+    reference: int = -1
 
     @classmethod
     def lost(cls, vertices: Floats, views: int) -> FrameResult:
@@ -85,6 +96,7 @@ class Registrar:
         cameras: of the views, by device name.
         images: the reference images, float32 mono, of the views that have one.
         options: see `track.stage.TrackSettings`.
+        flow: who measures it; None: the processor.
     """
 
     def __init__(
@@ -93,10 +105,12 @@ class Registrar:
         cameras: Mapping[str, Camera],
         images: Mapping[str, Floats32],
         options: RegistrarOptions,
+        flow: FlowBackend | None = None,
     ) -> None:
+        self._flow = flow if flow is not None else CpuFlow()
         self._surface, self._cameras, self._options = surface, cameras, options
         self._levels = options.windows.levels
-        self._pool = ThreadPoolExecutor(os.cpu_count() or 1)
+        self._pool = ThreadPoolExecutor(options.threads or os.cpu_count() or 1)
         self._mm_per_px = _pixel_size(cameras, surface.neutral)
         self._deformers = {
             mm: LaplacianDeformer(surface.neutral, surface.triangles, Stiffness(bending_mm=mm))
@@ -105,11 +119,32 @@ class Registrar:
         self._neutral = self.reference(-1, surface.neutral, images)
 
     def reference(
-        self, frame: int, vertices: Floats, images: Mapping[str, Floats32]
+        self,
+        frame: int,
+        vertices: Floats,
+        images: Mapping[str, Floats32],
+        only: Bools | None = None,
     ) -> FaceReference:
-        """What a frame (-1 the neutral) showed, its mesh (V, 3) being known, to match others to."""
-        placed, windows = (frame, vertices), self._options.windows
-        return face_reference(self._surface, placed, self._cameras, images, windows, self._pool)
+        """What a frame showed, its mesh being known, for others to be matched to.
+
+        Args:
+            frame: its number; -1 the neutral.
+            vertices: (V, 3) world mm.
+            images: float32 mono, of the views that have one.
+            only: (V,) vertices around which it is wanted; None: all.
+        """
+        around: Bools | None = None
+        if only is not None:
+            around = np.asarray(only[self._surface.samples.corners].any(axis=1))
+        return face_reference(
+            self._surface, (frame, vertices), self._cameras, images, self._options.windows,
+            self._pool, around,
+        )  # fmt: skip
+
+    @property
+    def surface(self) -> SurfaceModel:
+        """What is tracked."""
+        return self._surface
 
     @property
     def views_of_samples(self) -> Ints:
@@ -146,6 +181,24 @@ class Registrar:
             constraints, start=rigid.apply(rest), data_weight=10.0, rotation_iterations=3
         )
 
+    def pulled(self, start: Floats, sightings: Sequence[Sightings]) -> Floats:
+        """The mesh (V, 3), world mm, brought to what is sighted, smoothly and near by only."""
+        if not sightings:
+            return start
+        every = np.arange(len(start))
+        held = Constraints(
+            corners=np.repeat(every[:, None], 3, axis=1),
+            barycentric=np.tile([1.0, 0.0, 0.0], (len(start), 1)),
+            targets=start,
+            weights=np.full(len(start), _HELD_WEIGHT),
+        )
+        supple, out = self._deformers[min(self._deformers)], start
+        for _ in range(_PULLS):  # lifting is linear about the estimate
+            skin = self._surface.skin(out)
+            told = [one.constraints(out, skin, self._cameras) for one in sightings]
+            out = supple.solve(Constraints.joined([held, *told]), start=out)
+        return out
+
     def best_start(
         self, starts: Sequence[Floats], confidence: Floats, images: Mapping[str, Floats32]
     ) -> Floats:
@@ -179,6 +232,49 @@ class Registrar:
         supple = self._deformers[min(self._deformers)]
         return blended_start(starts, scores, samples, surface.neighbours, supple)
 
+    def scout(self, start: Floats, images: Mapping[str, Floats32]) -> tuple[Floats, float]:
+        """Find the head as one rigid piece, by the two coarsest rounds.
+
+        Args:
+            start: (V, 3) the neutral, about where the head is, world mm.
+            images: the frame's images, float32 mono.
+
+        Returns:
+            (V, 3) the neutral with the head; and the unrest, mm: how far skin that two views see
+            has left it, in the region that has done so most.
+        """
+        samples = self._surface.samples
+        usable = [name for name in self._neutral.views if name in images]
+        pyramids = {name: image_pyramid(images[name], self._levels) for name in usable}
+        matcher = self._matcher(None)
+        vertices, unrest = start, np.inf
+        for step in self._options.steps[:2]:
+            views = {name: pyramids[name][step.level] for name in usable}
+            seen = RoundImages(views=views, occluders={}, depth=None, stride=1)
+            lifted, matches = matcher.measure(step, vertices, seen)
+            agreed = np.flatnonzero(lifted.views >= _AGREED)
+            if len(agreed) < _SPANNING:
+                return start, float("inf")
+            places = samples.points(vertices)
+            motion = _robust_motion(places[agreed], places[agreed] + lifted.motion[agreed])
+            vertices = motion.apply(vertices)
+            able = np.zeros(len(samples), np.int64)
+            for told in matches.values():
+                able[told.seen] += 1
+            away = np.linalg.norm(places + lifted.motion - motion.apply(places), axis=1)
+            away[lifted.views < _AGREED] = _GONE_MM
+            unrest = self._unrest(away, able >= _AGREED)
+        return vertices, unrest
+
+    def _unrest(self, away: Floats, seen: Bools) -> float:
+        """The largest mean distance (N,) of the seen samples over a region, mm."""
+        share, mean = seen.astype(np.float64), np.where(seen, away, 0.0)
+        near = self._surface.neighbours
+        for _ in range(_UNREST_ROUNDS):
+            share, mean = near @ share + share, near @ mean + mean
+        known = share > 0.5 * float(np.median(share[seen])) if seen.any() else seen
+        return float((mean[known] / share[known]).max()) if known.any() else float("inf")
+
     def register(
         self, start: Floats, images: Mapping[str, Floats32], aids: FrameAids | None = None
     ) -> FrameResult:
@@ -200,12 +296,7 @@ class Registrar:
         if not usable:
             raise SolveError("no view of the frame has a reference image")
         pyramids = {name: image_pyramid(images[name], self._levels) for name in usable}
-        matcher = Matcher(
-            surface=self._surface,
-            references=(self._neutral, *known.references),
-            min_correlation=self._options.min_correlation,
-            pool=self._pool,
-        )
+        matcher = self._matcher(known.second)
         vertices = start
         occluders: dict[str, tuple[Floats32, float]] = {}
         depth: ScanDepth | None = None
@@ -222,7 +313,7 @@ class Registrar:
                     for name, (drawn, scale) in occluders.items()
                 },
                 depth=depth,
-                stride=self._options.search_stride if index == 0 else 1,
+                stride=1 if index > 0 else self._options.search_stride,
             )
             lifted, matches = matcher.measure(step, vertices, seen)
             before = vertices
@@ -233,7 +324,18 @@ class Registrar:
         told = frame_evidence(
             samples, len(vertices), matches, list(self._cameras), lifted, (agreement, moved)
         )
-        return self._result(vertices, lifted, weights, told)
+        found = self._result(vertices, lifted, weights, told)
+        return found if known.second is None else replace(found, reference=known.second.frame)
+
+    def _matcher(self, second: FaceReference | None) -> Matcher:
+        return Matcher(
+            surface=self._surface,
+            neutral=self._neutral,
+            second=second,
+            min_correlation=self._options.min_correlation,
+            pool=self._pool,
+            flow=self._flow,
+        )
 
     def _depth(self, name: str, vertices: Floats) -> tuple[Floats32, float]:
         """A coarse depth map of the mesh, and how many finest pixels one of its pixels spans."""
@@ -250,29 +352,30 @@ class Registrar:
         floor_mm = step.scale_px * 2**step.level * self._mm_per_px
         agreement = _agreement(self._surface.neighbours, lifted.motion, weights, floor_mm)
         weights *= agreement
-        used = np.flatnonzero(weights > 1e-4)
-        if len(used) < 12:
-            return vertices, weights, agreement
-        chosen = self._surface.samples.select(used.astype(np.int32))
-        targets = chosen.points(vertices) + lifted.motion[used]  # c = u - h n: Ma et al. 2.2
-        constraints = [
-            Constraints(
-                corners=chosen.corners,
-                barycentric=chosen.barycentric,
-                targets=targets,
-                weights=weights[used] / weights[used].mean(),
+        constraints = self._flow_constraints(vertices, lifted, weights)
+        deformer, turns = self._deformers[step.bending_mm], self._options.rotation_iterations
+        solved = vertices
+        if len(constraints.weights) >= _ENOUGH:
+            solved = deformer.solve(constraints, start=vertices, rotation_iterations=turns)
+        if near := [one for one in sightings if one.accuracy_px <= 2**step.level]:
+            # What one view or a curve leaves open is left where the flow alone puts it.
+            skin = self._surface.skin(solved)
+            every = [constraints, *(one.constraints(solved, skin, self._cameras) for one in near)]
+            solved = deformer.solve(
+                Constraints.joined(every), start=solved, rotation_iterations=turns
             )
-        ]
-        skin = self._surface.skin(vertices)
-        for sighted in sightings:
-            if sighted.accuracy_px <= 2**step.level:
-                constraints.append(sighted.constraints(vertices, skin, self._cameras))
-        solved = self._deformers[step.bending_mm].solve(
-            Constraints.joined(constraints),
-            start=vertices,
-            rotation_iterations=self._options.rotation_iterations,
-        )
         return solved, weights, agreement
+
+    def _flow_constraints(self, vertices: Floats, lifted: Lifted, weights: Floats) -> Constraints:
+        """Where the lifted samples put the mesh; their weights (N,) are 1 in the mean."""
+        used = np.flatnonzero(weights > 1e-4)
+        chosen = self._surface.samples.select(used.astype(np.int32))
+        return Constraints(
+            corners=chosen.corners,
+            barycentric=chosen.barycentric,
+            targets=chosen.points(vertices) + lifted.motion[used],  # c = u - h n: Ma et al. 2.2
+            weights=weights[used] / weights[used].mean() if len(used) else weights[used],
+        )
 
     def _result(
         self, vertices: Floats, lifted: Lifted, weights: Floats, told: FrameEvidence
@@ -297,12 +400,13 @@ class FrameAids:
 
     Attributes:
         scan: its own, world mm: it tells the depth of samples that one or two views alone see.
-        references: other frames than the neutral, whose meshes are known, to match it to.
+        second: another frame than the neutral, whose mesh is known, to match it to where the
+            neutral serves no more.
         sightings: surface points whose pixels are known.
     """
 
     scan: Scan | None = None
-    references: tuple[FaceReference, ...] = ()
+    second: FaceReference | None = None
     sightings: tuple[Sightings, ...] = ()
 
 
@@ -316,6 +420,7 @@ class RegistrarOptions:
         min_correlation: least NCC believed.
         search_stride: in the first round every how manieth sample is matched.
         rotation_iterations: updates of the local frames in each solve.
+        threads: over the views; 0: as many as there are processors. Results do not depend on it.
     """
 
     steps: tuple[Step, ...]
@@ -323,10 +428,22 @@ class RegistrarOptions:
     min_correlation: float
     search_stride: int
     rotation_iterations: int
+    threads: int = 0
 
     def __post_init__(self) -> None:
         if not self.steps:
             raise SettingsError("steps: expected at least one")
+
+
+def _robust_motion(before: Floats, after: Floats) -> Similarity:
+    """The rigid motion that most points (n, 3) follow."""
+    weights = np.ones(len(before))
+    for _ in range(_MOTION_ROUNDS):
+        motion = fit_similarity(before, after, weights)
+        away: Floats = np.linalg.norm(motion.apply(before) - after, axis=1)
+        scale = max(_STILL_MM, float(np.median(away)))
+        weights = 1.0 / (1.0 + (away / scale) ** 2) ** 2
+    return motion
 
 
 def _agreement(

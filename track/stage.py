@@ -4,95 +4,45 @@
 
     TAKE/products/track/performance.npz      the product
     TAKE/products/track/report.json          figures by frame
+    TAKE/products/track/quality.npz, .csv    quality by frame and vertex; see track/quality_report
+    TAKE/products/track/anchors.json         where the take was cut
     TAKE/products/track/frames/*.npz         finished frames, kept so that work can be resumed
+    TAKE/products/track/corrected/*.npz      frames solved again for TAKE/corrections.json
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-import time
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from capture.archive import read_archive, write_archive
-from capture.arrays import Bools, Floats, Floats32
-from capture.camera import CameraArray
-from capture.errors import ShapeError, TakeError
+from capture.arrays import Bools, Floats
+from capture.documents import read_json
+from capture.errors import SettingsError, TakeError
 from capture.product import hash_file, is_current, replacing, stage_record, write_record
 from capture.progress import Progress, silent
-from capture.settings import check_ranges
 from capture.take import Take
-from recon.images import mono
 from recon.mesh import Mesh
-from recon.scan import load_scan
-from track.evidence import EVIDENCE_KEYS, FrameEvidence
-from track.face_reference import ReferenceWindows
-from track.head_motion import damped_motion, head_motion
+from track.anchors import Segment, choose_anchors, segments
+from track.corrections.replay import Corrections, read_corrections
+from track.face_tracker import FaceTracker
+from track.frame_store import FrameStore, TrackedFrame
+from track.head_motion import head_motion
 from track.landmark_file import Landmarks, read_landmarks
 from track.performance import Performance, read_performance, write_performance
-from track.pyramid import level_count
-from track.registration import FrameAids, FrameResult, Registrar, RegistrarOptions
+from track.quality_report import write_quality_report
+from track.resolve import ResolveSettings, corrected, resolve, runs_of
 from track.rigid import fit_similarity
-from track.schedule import schedule
-from track.skin import skin_heights
-from track.surface_model import SurfaceModel
+from track.sweep import SweepStores, sweep
+from track.track_settings import TrackSettings as TrackSettings
 
-_FIGURES = ("samples", "correlation", "residual_px", "views", "seconds")
-_MIN_VIEWS = 2
-_SPANNING = 100  # confident vertices from which a motion is told
-_SKIN_LIMIT_MM = 1.0  # a scan farther from the neutral shows something else
-
-
-@dataclass(frozen=True, kw_only=True)
-class TrackSettings:
-    """Settings of the tracking stage.
-
-    Attributes:
-        spacing_mm: triangles wider than this get samples inside; every vertex is one anyway.
-        search_mm: how far skin may move from one frame to the next beyond the head's motion.
-        passes: rounds of guide, match, lift and solve at full resolution.
-        half_window_px: matching windows have 2 half + 1 px a side at full resolution.
-        half_window_coarse_px: the same at the coarser pyramid levels.
-        bending_coarse_mm: stiffness of the first round; bumps shorter than about six times this
-            are left for later rounds.
-        bending_mm: stiffness of the last round.
-        min_cosine: least cosine between the skin's normal and the view.
-        min_correlation: least correlation of a match.
-        search_stride: in the first round every how manieth sample is matched.
-        rotation_iterations: updates of the local frames in each solve.
-        extrapolation: share of the head's last motion expected again.
-        use_scan: use the scans that `likeness recon` made. The first frame's tells how far the
-            skin lies over the neutral, which matters where the neutral is not quite on it; that
-            of any other frame the depth of skin that one or two views alone see there.
-    """
-
-    spacing_mm: float = 6.0
-    search_mm: float = 12.0
-    passes: int = 2
-    half_window_px: int = 6
-    half_window_coarse_px: int = 4
-    bending_coarse_mm: float = 4.0
-    bending_mm: float = 2.0
-    min_cosine: float = 0.35
-    min_correlation: float = 0.6
-    search_stride: int = 3
-    rotation_iterations: int = 2
-    extrapolation: float = 0.7
-    use_scan: bool = True
-
-    def __post_init__(self) -> None:
-        check_ranges(
-            "track", self, spacing_mm=(0.2, 100.0), search_mm=(0.1, 50.0), passes=(1, 10),
-            half_window_px=(3, 20), half_window_coarse_px=(3, 20),
-            bending_coarse_mm=(0.05, 100.0), bending_mm=(0.05, 100.0), min_cosine=(0.05, 0.95),
-            min_correlation=(0.0, 0.99), search_stride=(1, 100), rotation_iterations=(1, 10),
-            extrapolation=(0.0, 1.0),
-        )  # fmt: skip
+_MAX_WORKERS = 64
 
 
 def track(
@@ -101,13 +51,17 @@ def track(
     settings: TrackSettings,
     *,
     landmarks: Path | None = None,
+    again: tuple[int, int] | None = None,
+    workers: int = 1,
     progress: Progress = silent,
 ) -> Performance:
     """Track a mesh, registered to the first frame, through all frames of a take.
 
-    Every frame is matched to the first one, so that errors do not add up; the frame before it
-    only says where to look. Finished frames are kept in TAKE/products/track/frames and used again
-    while take, neutral, settings and code are the same.
+    Every frame is matched to the first one, so that errors do not add up. The take is cut where
+    the face comes back to the neutral (anchors, registered directly); between, it is followed
+    forwards and looked at again backwards. TAKE/corrections.json is worked in afterwards. Finished
+    frames are kept in TAKE/products/track/frames and used again while take, neutral, settings and
+    code are the same.
 
     Args:
         take: it needs cameras.
@@ -115,240 +69,211 @@ def track(
         settings: see `TrackSettings`.
         landmarks: hand marks of the first frame, three or more; see docs/neutral.md. The neutral
             is moved rigidly onto them first: for a take whose head is not where the neutral is.
+        again: first and last frame to solve again with their corrections, the whole range being
+            carried by them; None: corrections reach as far as the settings say.
+        workers: processes among which segments are shared; the result does not depend on it.
         progress: told after each frame.
 
     Returns:
         What TAKE/products/track/performance.npz holds. `head_from_neutral` is measured on the
-        skin that moves least; `reference` is -1 throughout.
+        skin that moves least.
 
     Raises:
         CameraError: when the take has no cameras, or they do not fit.
         TakeError: when the take has no frames, too few views of the first one, or no view sees
-            the neutral; or when the landmarks cannot be read, or are fewer than three.
+            the neutral; when the landmarks cannot be read, or are fewer than three; or listing
+            what does not fit in the corrections.
+        SettingsError: when `workers` is out of range.
         SolveError: when a solve does not reach an answer.
     """
-    out = take.products / "track" / "performance.npz"
+    if not 1 <= workers <= _MAX_WORKERS:
+        raise SettingsError(f"workers: expected 1..{_MAX_WORKERS}, found {workers}")
     frames = _frames(take)
-    scans = _scans(take) if settings.use_scan else {}
     if landmarks is not None:
         marks = read_landmarks(landmarks, len(neutral.vertices), take.cameras())
         neutral = _laid_on(neutral, marks, landmarks)
-    records = _records(settings, _inputs(take, neutral), frames, scans)
-    record = records[frames[-1]]
+    plan = _Plan(take, neutral, settings)
+    corrections = read_corrections(take, neutral)
+    reach = ResolveSettings(
+        reach_frames=settings.correction_reach, ease_frames=settings.correction_ease
+    )
+    run = runs_of(frames, corrections, reach, again)
+    record = plan.whole_record(corrections, run)
+    out = plan.folder / "performance.npz"
     if is_current(out, record):
         return read_performance(out)
-    work = _Work(take, neutral, take.cameras(), settings, scans)
-    shelf = _FrameShelf(out.parent / "frames", records)
-    results = [work.reference(frames[0])]
-    progress(1, len(frames), "track")
-    for done, frame in enumerate(frames[1:], start=2):
-        found = shelf.load(frame, len(neutral.vertices))
-        if found is None:
-            found = work.follow(frame, results)
-            shelf.save(frame, found)
-        results.append(found)
-        progress(done, len(frames), "track")
-    performance, report = _assemble(neutral, frames, results)
+    tracker = FaceTracker(take, neutral, settings, plan.scans)
+    anchors = _cut(plan, tracker, corrections.anchors, progress)
+    found = _follow(plan, tracker, anchors, workers, progress)
+    store = FrameStore(plan.folder / "corrected", dict.fromkeys(run, record), len(neutral.vertices))
+    counted = _Counter(progress, len(run), "correct")
+    solved = resolve(tracker, found, corrections, run, store, counted)
+    final = corrected(frames, found, solved, corrections, settings.correction_ease)
+    performance, report = _assemble(neutral, frames, final)
+    report["anchors"] = list(anchors)
+    report["solved_again"] = list(run)
+    evidence, cameras = [result.evidence for result in final], take.cameras()
+    told = write_quality_report(plan.folder, neutral, performance, evidence, cameras, plan.scans)
     write_performance(out, performance)
     with replacing(out.with_name("report.json")) as partial:
-        partial.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+        partial.write_text(json.dumps(told.joined(report), indent=1) + "\n", encoding="utf-8")
     write_record(out, record)
     return performance
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class _Tracked:
-    """One finished frame: arrays as stored (float32), figures by name."""
+class _Plan:
+    """What a take's frames are made from, and where they are kept."""
 
-    vertices: Floats32
-    confidence: Floats32
-    figures: Mapping[str, float]
-    evidence: FrameEvidence
+    def __init__(self, take: Take, neutral: Mesh, settings: TrackSettings) -> None:
+        self.take, self.neutral, self.settings = take, neutral, settings
+        self.folder = take.products / "track"
+        self.scans = _scans(take) if settings.use_scan else {}
+        shape = hashlib.sha256(neutral.vertices.tobytes() + neutral.polygons.tobytes()).hexdigest()
+        self._inputs = {"take": take.input_hash(), "neutral": shape}
+        self._hashes = {frame: hash_file(path) for frame, path in self.scans.items()}
 
+    def record(self, what: str, frames: Sequence[int]) -> dict[str, Any]:
+        """The record of a product of these frames: their scans, and the first frame's."""
+        first = self.take.frames[0]
+        told = "\n".join(f"{f} {self._hashes.get(f, '')}" for f in [first, *frames])
+        digest = hashlib.sha256(told.encode()).hexdigest()
+        return stage_record("track", self.settings, {**self._inputs, what: digest})
 
-class _FrameShelf:
-    """Finished frames on disk, each valid for its record."""
+    def whole_record(self, corrections: Corrections, run: Mapping[int, int]) -> dict[str, Any]:
+        """The record of the performance."""
+        keys = [f"{frame} {corrections.key(frame)}" for frame in self.take.frames]
+        keys += [f"{frame} from {source}" for frame, source in run.items()]
+        record = self.record("scans", self.take.frames)
+        record["inputs"]["corrections"] = hashlib.sha256("\n".join(keys).encode()).hexdigest()
+        return record
 
-    def __init__(self, folder: Path, records: Mapping[int, Mapping[str, Any]]) -> None:
-        self._folder, self._records = folder, records
-
-    def load(self, frame: int, vertex_count: int) -> _Tracked | None:
-        """The stored frame, or None when there is none that was made this way."""
-        path = self._path(frame)
-        if not is_current(path, self._records[frame]):
-            return None
-        try:
-            keys = ("vertices", "confidence", "figures", *EVIDENCE_KEYS)
-            held = read_archive(path, required=keys, gaps=EVIDENCE_KEYS)
-        except ShapeError:
-            return None  # damaged: made again
-        if held["vertices"].shape != (vertex_count, 3):
-            return None
-        return _Tracked(
-            vertices=held["vertices"],
-            confidence=held["confidence"],
-            figures=dict(zip(_FIGURES, held["figures"].tolist(), strict=True)),
-            evidence=FrameEvidence(**{key: held[key] for key in EVIDENCE_KEYS}),
+    def stores(self, segment: Segment) -> SweepStores:
+        """Where a segment's frames are kept; they hang on all of it."""
+        ends = [segment.left] if segment.right is None else [segment.left, segment.right]
+        record = self.record("segment", [*ends, *segment.frames])
+        records = dict.fromkeys(segment.frames, record)
+        count = len(self.neutral.vertices)
+        return SweepStores(
+            forward=FrameStore(self.folder / "forward", records, count),
+            final=FrameStore(self.folder / "frames", records, count),
         )
 
-    def save(self, frame: int, tracked: _Tracked) -> None:
-        """Store a frame, whole or not at all."""
-        path = self._path(frame)
-        figures = np.array([tracked.figures[name] for name in _FIGURES])
-        shape = {"vertices": tracked.vertices, "confidence": tracked.confidence}
-        write_archive(path, {**shape, "figures": figures, **tracked.evidence.arrays()})
-        write_record(path, self._records[frame])
-
-    def _path(self, frame: int) -> Path:
-        return self._folder / f"frame_{frame:04d}.npz"
+    def anchor_store(self, anchors: Sequence[int]) -> FrameStore:
+        """Where the anchors are kept."""
+        records = {frame: self.record("anchor", [frame]) for frame in anchors}
+        return FrameStore(self.folder / "frames", records, len(self.neutral.vertices))
 
 
-class _Work:
-    """The registrar of a take, made when a frame is first asked for."""
+class _Counter:
+    """Tells progress of frames that are done in any order."""
 
-    def __init__(
-        self,
-        take: Take,
-        neutral: Mesh,
-        cameras: CameraArray,
-        settings: TrackSettings,
-        scans: Mapping[int, Path],
-    ) -> None:
-        self._take, self._neutral, self._settings = take, neutral, settings
-        self._cameras, self._scans = cameras, scans
-        self._registrar: Registrar | None = None
+    def __init__(self, progress: Progress, total: int, what: str, done: int = 0) -> None:
+        self._progress, self._total, self._what, self._done = progress, total, what, done
 
-    def reference(self, frame: int) -> _Tracked:
-        """The first frame: the neutral itself."""
-        began = time.perf_counter()
-        registrar = self._made()
-        confidence = registrar.vertex_views()
-        if not confidence.any():
-            names = ", ".join(self._cameras.names)
-            raise TakeError(
-                f"{self._take.folder}: no two views see the neutral at frame {frame}; its vertices "
-                f"lie about {np.round(self._neutral.vertices.mean(axis=0), 1).tolist()} mm; is it "
-                f"in world millimetres of the cameras {names}?"
-            )
-        seen = registrar.views_of_samples
-        figures = {
-            "samples": float((seen >= _MIN_VIEWS).sum()),
-            "correlation": 1.0,
-            "residual_px": 0.0,
-            "views": float(seen[seen >= _MIN_VIEWS].mean()),
-            "seconds": time.perf_counter() - began,
+    def __call__(self, frame: int) -> None:
+        self._done += 1
+        self._progress(self._done, self._total, self._what)
+
+
+def _cut(
+    plan: _Plan, tracker: FaceTracker, wanted: Sequence[int], progress: Progress
+) -> dict[int, Floats]:
+    """The anchors, and where the head puts the neutral (V, 3) in each."""
+    path, frames = plan.folder / "anchors.json", plan.take.frames
+    record = plan.record("anchors", ())
+    if not is_current(path, record):
+        start, rows = plan.neutral.vertices.astype(np.float64), []
+        tracker.first(frames[0])
+        rest = start
+        for done, frame in enumerate(frames[1:], start=1):
+            start, unrest = tracker.scout(frame, start)
+            motion = fit_similarity(rest, start)
+            told = unrest if np.isfinite(unrest) else None
+            rows.append({"frame": frame, "unrest_mm": told, "head": motion.matrix().tolist()})
+            progress(done, len(frames) - 1, "scout")
+        with replacing(path) as partial:
+            partial.write_text(json.dumps({"frames": rows}, indent=1) + "\n", encoding="utf-8")
+        write_record(path, record)
+    rows = read_json(path, TakeError, absent="no anchors")["frames"]
+    unrest_mm = {frames[0]: 0.0}
+    for row in rows:
+        told = row["unrest_mm"]
+        unrest_mm[int(row["frame"])] = float("inf") if told is None else float(told)
+    heads = {int(row["frame"]): np.array(row["head"]) for row in rows}
+    rest = plan.neutral.vertices.astype(np.float64)
+    placed = {frame: rest @ head[:3, :3].T + head[:3, 3] for frame, head in heads.items()}
+    return {frame: placed.get(frame, rest) for frame in choose_anchors(unrest_mm, wanted)}
+
+
+def _follow(
+    plan: _Plan,
+    tracker: FaceTracker,
+    anchors: Mapping[int, Floats],
+    workers: int,
+    progress: Progress,
+) -> dict[int, TrackedFrame]:
+    """All frames: anchors directly, segments between them."""
+    frames = plan.take.frames
+    store = plan.anchor_store(list(anchors))
+    counted = _Counter(progress, len(frames), "track")
+    ends: dict[int, TrackedFrame] = {}
+    for frame, start in anchors.items():
+        kept = store.load(frame)
+        if kept is None:
+            first = frame == frames[0]
+            kept = tracker.first(frame) if first else tracker.direct(frame, start)
+            store.save(frame, kept)
+        ends[frame] = kept
+        counted(frame)
+    parts = segments(frames, list(anchors))
+    if min(workers, len(parts)) > 1:
+        _side_by_side(plan, parts, ends, min(workers, len(parts)), counted)
+    else:
+        for part in parts:
+            sweep(tracker, part, ends, plan.stores(part), counted)
+    found = dict(ends)
+    for part in parts:
+        stores = plan.stores(part)
+        for frame in part.frames:
+            kept = stores.final.load(frame)
+            if kept is None:
+                raise TakeError(f"{plan.folder}: frame {frame} was finished, but is not there")
+            found[frame] = kept
+    return found
+
+
+def _side_by_side(
+    plan: _Plan,
+    parts: Sequence[Segment],
+    ends: Mapping[int, TrackedFrame],
+    workers: int,
+    told: Callable[[int], None],
+) -> None:
+    """Sweep segments in processes of their own; each reads the take for itself."""
+    folder, neutral, settings = plan.take.folder, plan.neutral, plan.settings
+    pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn"))
+    try:
+        jobs = {
+            pool.submit(_sweep_alone, folder, neutral, settings, p, dict(ends)): p for p in parts
         }
-        return _Tracked(
-            vertices=self._neutral.vertices.astype(np.float32),
-            confidence=confidence.astype(np.float32),
-            figures=figures,
-            evidence=FrameEvidence.nothing(len(confidence), len(self._cameras)),
-        )
-
-    def follow(self, frame: int, before: list[_Tracked]) -> _Tracked:
-        """Register one frame, beginning where the last ones lead."""
-        began = time.perf_counter()
-        start = self._predict(before)
-        images = self._images(frame)
-        if len(images) < _MIN_VIEWS:
-            result = FrameResult.lost(start, len(self._cameras))
-        else:
-            registrar = self._made()
-            sure = before[-1].confidence.astype(np.float64)
-            scan = load_scan(self._scans[frame]) if frame in self._scans else None
-            starts = [registrar.carried(start, sure), *self._other_starts(start, before)]
-            result = registrar.register(
-                registrar.best_start(starts, sure, images), images, FrameAids(scan=scan)
-            )
-        figures = {
-            "samples": float(result.samples),
-            "correlation": result.correlation,
-            "residual_px": result.residual_px,
-            "views": result.views,
-            "seconds": time.perf_counter() - began,
-        }
-        return _Tracked(
-            vertices=result.vertices.astype(np.float32),
-            confidence=result.confidence.astype(np.float32),
-            figures=figures,
-            evidence=result.evidence,
-        )
-
-    def _predict(self, before: list[_Tracked]) -> Floats:
-        last = before[-1].vertices.astype(np.float64)
-        if len(before) < 2 or self._settings.extrapolation == 0.0:
-            return last
-        weights = (before[-1].confidence * before[-2].confidence).astype(np.float64)
-        if (weights > 0).sum() < _SPANNING:
-            return last
-        earlier = before[-2].vertices.astype(np.float64)
-        return damped_motion(earlier, last, weights, self._settings.extrapolation).apply(last)
-
-    def _other_starts(self, start: Floats, before: list[_Tracked]) -> list[Floats]:
-        """Beside the carried mesh: the neutral with the head, and the motion going on."""
-        neutral = self._neutral.vertices.astype(np.float64)
-        sure = before[-1].confidence.astype(np.float64)
-        if (sure > 0).sum() < _SPANNING:
-            return []
-        head = head_motion(neutral, start[None], sure[None]).head_from_neutral[0]
-        out = [neutral @ head[:3, :3].T + head[:3, 3]]
-        weights = sure * before[-2].confidence if len(before) > 1 else np.zeros(len(sure))
-        if (weights > 0).sum() >= _SPANNING:
-            last, earlier = (b.vertices.astype(np.float64) for b in (before[-1], before[-2]))
-            out.append(start + last - damped_motion(earlier, last, weights, 1.0).apply(earlier))
-        return out
-
-    def _made(self) -> Registrar:
-        if self._registrar is None:
-            first = self._take.frames[0]
-            images = self._images(first)
-            if len(images) < _MIN_VIEWS:
-                raise TakeError(
-                    f"{self._take.folder}: frame {first} has {len(images)} of "
-                    f"{len(self._cameras)} views; the reference needs at least {_MIN_VIEWS}"
-                )
-            mesh = self._neutral
-            surface = SurfaceModel.of(
-                mesh.vertices, mesh.triangles, self._settings.spacing_mm, self._heights()
-            )
-            cameras = {camera.name: camera for camera in self._cameras}
-            options = _options(self._settings, self._cameras, mesh)
-            self._registrar = Registrar(surface, cameras, images, options)
-        return self._registrar
-
-    def _heights(self) -> Floats | None:
-        """How far the first frame's scan lies over the neutral, where there is such a scan."""
-        first = self._take.frames[0]
-        if first not in self._scans:
-            return None
-        mesh = self._neutral
-        scan = load_scan(self._scans[first])
-        return skin_heights(mesh.vertices, mesh.triangles, scan, _SKIN_LIMIT_MM)
-
-    def _images(self, frame: int) -> dict[str, Floats32]:
-        take = self._take
-        names = [name for name in take.device_names if take.present(name, frame)]
-        return {name: mono(take.image(name, frame)) for name in names}
+        for job in as_completed(jobs):
+            job.result()
+            for frame in jobs[job].frames:
+                told(frame)
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
-def _options(settings: TrackSettings, cameras: CameraArray, neutral: Mesh) -> RegistrarOptions:
-    centre = neutral.vertices.mean(axis=0)[None]
-    scales = [camera.fx / abs(float(camera.depths(centre)[0])) for camera in cameras]
-    px_per_mm = float(np.median(scales))
-    levels = min(level_count(camera.width, camera.height) for camera in cameras)
-    bending = (settings.bending_coarse_mm, settings.bending_mm)
-    return RegistrarOptions(
-        steps=schedule(levels, settings.search_mm * px_per_mm, settings.passes, bending),
-        windows=ReferenceWindows(
-            levels=levels,
-            half=settings.half_window_px,
-            half_coarse=settings.half_window_coarse_px,
-            min_cosine=settings.min_cosine,
-        ),
-        min_correlation=settings.min_correlation,
-        search_stride=settings.search_stride,
-        rotation_iterations=settings.rotation_iterations,
-    )
+def _sweep_alone(
+    folder: Path,
+    neutral: Mesh,
+    settings: TrackSettings,
+    part: Segment,
+    ends: dict[int, TrackedFrame],
+) -> None:
+    plan = _Plan(Take.open(folder), neutral, settings)
+    tracker = FaceTracker(plan.take, neutral, settings, plan.scans, threads=1)
+    sweep(tracker, part, ends, plan.stores(part), lambda frame: None)
 
 
 def _frames(take: Take) -> tuple[int, ...]:
@@ -364,12 +289,6 @@ def _scans(take: Take) -> dict[int, Path]:
     return {frame: path for frame, path in paths.items() if path.is_file()}
 
 
-def _inputs(take: Take, neutral: Mesh) -> dict[str, str]:
-    """Hashes of what every frame is made from."""
-    shape = hashlib.sha256(neutral.vertices.tobytes() + neutral.polygons.tobytes()).hexdigest()
-    return {"take": take.input_hash(), "neutral": shape}
-
-
 def _laid_on(neutral: Mesh, marks: Landmarks, path: Path) -> Mesh:
     """The neutral moved rigidly onto marks of the first frame."""
     if len(marks.vertices) < 3:
@@ -378,28 +297,8 @@ def _laid_on(neutral: Mesh, marks: Landmarks, path: Path) -> Mesh:
     return neutral.with_vertices(motion.apply(neutral.vertices))
 
 
-def _records(
-    settings: TrackSettings,
-    inputs: Mapping[str, str],
-    frames: tuple[int, ...],
-    scans: Mapping[int, Path],
-) -> dict[int, dict[str, Any]]:
-    """What each frame is made from: its scan and those before it, since it begins from them.
-
-    A new scan thus makes its frame and the later ones again, as if it had been there at first. The
-    last frame's record is that of the performance.
-    """
-    digest = hashlib.sha256()
-    out = {}
-    for frame in frames:
-        if frame in scans:
-            digest.update(f"{frame} {hash_file(scans[frame])}\n".encode())
-        out[frame] = stage_record("track", settings, {**inputs, "scans": digest.hexdigest()})
-    return out
-
-
 def _assemble(
-    neutral: Mesh, frames: tuple[int, ...], results: list[_Tracked]
+    neutral: Mesh, frames: tuple[int, ...], results: Sequence[TrackedFrame]
 ) -> tuple[Performance, dict[str, Any]]:
     vertices = np.stack([result.vertices for result in results])
     confidence = np.stack([result.confidence for result in results])
@@ -416,7 +315,7 @@ def _assemble(
         polygons=neutral.polygons,
         frames=np.array(frames, dtype=np.int64),
         head_from_neutral=motions,
-        reference=np.full(len(frames), -1, dtype=np.int64),
+        reference=np.array([result.reference for result in results], dtype=np.int64),
     )
     rows = [
         {

@@ -7,14 +7,17 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from scipy import sparse
 
 from capture.arrays import Bools, Floats, Floats32, Ints32, check_shape
 from capture.camera import Camera
 from recon.mesh import vertex_normals
 from track.raster import RasterBuffers, Rasterizer
+from track.surface_samples import vertex_rings
 
 _GAP_MM = 1.5  # a vertex this far behind the surface shown at its pixel is hidden
 _COSINE = 0.25  # skin turned further away is not baked: its pixel holds too much of it
+_UNROLLED = 8  # edges from seen skin over which hidden skin looks like it
 _DARK = 0.25  # of the skin's median: what nothing is known of
 
 
@@ -82,7 +85,8 @@ class ActorSkin:
         count = known.sum(axis=0)
         typical = float(np.median(total[count > 0] / count[count > 0])) if count.any() else 0.5
         self._typical = typical
-        self._mean = np.where(count > 0, total / np.maximum(count, 1), _DARK * typical)
+        mean = np.where(count > 0, total / np.maximum(count, 1), np.nan)
+        self._mean = _unrolled(mean, triangles, _DARK * typical)
         self._row = {name: row for row, name in enumerate(cameras)}
 
     def draw(
@@ -140,6 +144,22 @@ class ActorSkin:
         shown = np.full((1, 1), _DARK, np.float32) if opening is None else opening
         image[gone] = self._typical * cv2.resize(shown, size, interpolation=cv2.INTER_LINEAR)[gone]
         return np.asarray(image, dtype=np.float32)
+
+
+def _unrolled(values: Floats, triangles: Ints32, beyond: float) -> Floats:
+    """Values (V,) with the unknown ones taken from their neighbours, some edges far.
+
+    A lid that closes shows skin that was rolled up: it looks as what lies beside it does. What
+    lies deeper, a mouth bag say, gets the value `beyond`.
+    """
+    rings = sparse.csr_matrix(vertex_rings(triangles, len(values), 1), dtype=np.float64)
+    filled = values.copy()
+    for _ in range(_UNROLLED):
+        known = np.isfinite(filled)
+        count = rings @ known.astype(np.float64)
+        near = (rings @ np.where(known, filled, 0.0)) / np.maximum(count, 1.0)
+        filled = np.where(~known & (count > 0), near, filled)
+    return np.where(np.isfinite(filled), filled, beyond)
 
 
 def _shown(camera: Camera, vertices: Floats, normals: Floats, buffers: RasterBuffers) -> Bools:

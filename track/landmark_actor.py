@@ -33,7 +33,7 @@ _FEWEST = 6  # landmarks that a view must tell to be worth a predictor
 _STEADY = [*range(17, 37), 39, 42, 45]  # brows, nose, corners of the eyes: they tell the head
 _LEAST_STEADY = 6
 _SCALE_MM = 4.0
-_HONEST = 1.2  # how much further off real pictures are than made-up ones
+_HONEST = 1.5  # how much further off real pictures are than made-up ones
 _LEAST_PX = 0.6  # whole pixels are told
 
 

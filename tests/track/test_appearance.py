@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from capture.pose import Pose
 from tests.track.landmark_face import face, face_cameras, face_map, noisy_skin, photograph
 from track.appearance import ActorSkin, bake_appearance
 
@@ -51,3 +52,21 @@ def test_moved_skin_looks_as_it_would_be_photographed(images: dict[str, np.ndarr
     inside = true != np.float32(0.08)
     assert np.abs(drawn - true)[inside].mean() < 0.02
     assert np.abs(images[name] - true)[inside].mean() > 0.04  # it did move
+
+
+def test_skin_that_no_view_showed_looks_like_what_lies_beside_it() -> None:
+    name, camera = list(CAMERAS.items())[1]
+    image = photograph(camera, MESH, MESH.vertices, SKIN)
+    skin = ActorSkin(MESH.vertices, MESH.triangles, {name: camera}, {name: image})
+    head = np.eye(4)
+    head[:3, :3] = Pose.from_rotation_vector(np.array([0.0, 0.25, 0.0]), np.zeros(3)).rotation
+    turned = MESH.vertices @ head[:3, :3].T
+    true = photograph(camera, MESH, turned, SKIN)
+    drawn = skin.draw(name, camera, turned, head)
+    baked = np.isfinite(
+        bake_appearance(MESH.vertices, MESH.triangles, {name: camera}, {name: image})
+    )
+    corners = MESH.triangles[np.maximum(drawn.buffers.triangle, 0)]
+    new = (drawn.buffers.triangle >= 0) & ~baked[0][corners].any(axis=2)
+    assert new.sum() > 500  # pixels
+    assert np.abs(drawn.image - true)[new].mean() < 0.12  # a dark patch would be 0.35 off

@@ -41,7 +41,11 @@ def _matches(motion: Floats, yaw: float, late_px: float = 0.0) -> ViewMatches:
         information=np.tile([9.0, 0.0, 9.0], (COUNT, 1)),
     )
     return ViewMatches(
-        seen=which, correlation=0.9, observations=seen, believed=np.full(COUNT, 0.95)
+        seen=which,
+        correlation=0.9,
+        observations=seen,
+        believed=np.full(COUNT, 0.95),
+        second=np.zeros(COUNT, np.bool_),
     )
 
 

@@ -329,10 +329,12 @@ def main() -> None:
     parser.add_argument("take", type=Path, help="a visiting take with neutral.obj and truth.npz")
     parser.add_argument("--frames", type=int, nargs="+", default=[5])
     parser.add_argument("--views", type=int, default=0, help="how many, from the middle; 0: all")
+    parser.add_argument("--half-window", type=int, default=TrackSettings().half_window_px)
     parser.add_argument("--methods", nargs="+", default=names, choices=names)
     arguments = parser.parse_args()
     cv2.setNumThreads(1)  # processor seconds of one core
-    scene = load_scene(arguments.take, arguments.views, TrackSettings())
+    settings = TrackSettings(half_window_px=arguments.half_window)
+    scene = load_scene(arguments.take, arguments.views, settings)
     for row in rows(scene, arguments.frames, arguments.methods):
         print(json.dumps(row), flush=True)
 

@@ -50,6 +50,7 @@ def judged(take: Take) -> None:
     ]  # fmt: skip
     report = {"frames": rows, "view_remarks": ["right is about 1.0 frames late"]}
     (folder / "report.json").write_text(json.dumps(report), encoding="utf-8")
+    (folder / "anchors.json").write_text("{}", encoding="utf-8")  # not the report
     (folder / "quality.csv").write_text("frame,likely_error_mm\n0,0.0\n", encoding="utf-8")
 
 

@@ -99,7 +99,7 @@ class TakeInputs:
     @cached_property
     def track_report(self) -> Mapping[str, Any]:
         """What tracking says of itself; empty when it says nothing."""
-        return _first_object(self.take.products / "track")
+        return json_object(self.take.products / "track" / "report.json")
 
     @cached_property
     def records(self) -> dict[str, Mapping[str, Any]]:
@@ -204,10 +204,3 @@ def json_object(path: Path) -> dict[str, Any]:
     if not isinstance(document, dict):
         raise InputError(f"{path}: expected a JSON object, found {type(document).__name__}")
     return document
-
-
-def _first_object(folder: Path) -> dict[str, Any]:
-    for path in sorted(folder.glob("*.json")):
-        if not path.name.endswith(".record.json"):
-            return json_object(path)
-    return {}

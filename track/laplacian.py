@@ -197,7 +197,7 @@ class LaplacianDeformer:
         total = float(area.sum())
         scale = lengths.bending_mm**4 / total
         self._bending = sparse.csr_matrix(laplacian @ sparse.diags(scale * stiff / area))
-        self._delta = laplacian @ rest
+        self._laplacian, self._delta = laplacian, laplacian @ rest
         self._soft = lengths.membrane_mm**2 / total * self._w * 0.5
         self._soft *= stiff[self._i] + stiff[self._j]
         membrane = _edge_laplacian(len(rest), self._i, self._j, self._soft)
@@ -211,6 +211,7 @@ class LaplacianDeformer:
         data_weight: float = 1.0,
         rotation_iterations: int = 2,
         prior: Floats | None = None,
+        about: tuple[Floats, Floats] | None = None,
     ) -> Floats:
         """Solve for the vertices that meet the constraints (Ma et al. 2016, Eq. 1).
 
@@ -224,6 +225,9 @@ class LaplacianDeformer:
             data_weight: lambda of Eq. 1.
             rotation_iterations: how often rotations are estimated and the system is solved, >= 1.
             prior: (V,) non-negative weights that pull vertices to `start`; None for no pull.
+            about: another shape (V, 3), mm, that the surface bends from instead of its rest, and
+                the share (V,) 0..1 that this one has. What the surface has already left its rest by
+                is then not smoothed away. None: the rest.
 
         Returns:
             (V, 3) vertices, mm.
@@ -237,6 +241,8 @@ class LaplacianDeformer:
         moved = _rigid_part(constraints, start).apply(start)
         pull = np.zeros(len(start)) if prior is None else prior
         check_shape(start=(start, "V 3"), prior=(pull, "V"))
+        if about is not None:
+            check_shape(start=(start, "V 3"), about=(about[0], "V 3"), share=(about[1], "V"))
         hold = self._share * self._hold(constraints, pull)
         pull = self._share * pull
         count = max(len(constraints.weights), 1)
@@ -246,8 +252,8 @@ class LaplacianDeformer:
         fixed = weighted @ constraints.targets + hold[:, None] * moved + pull[:, None] * start
         vertices = moved
         for _ in range(rotation_iterations):
-            rotations = self._rotations(vertices)
-            vertices = solver.solve(np.ascontiguousarray(fixed + self._resting(rotations)))
+            resting = self._resting(vertices, about)
+            vertices = solver.solve(np.ascontiguousarray(fixed + resting))
         if not np.isfinite(vertices).all():
             raise SolveError(f"Laplacian deformation of {len(start)} vertices: not finite")
         return vertices
@@ -276,10 +282,11 @@ class LaplacianDeformer:
         held = np.bincount(touched, np.concatenate([weights, prior]), minlength=count)
         return np.where(held > 0.0, _HOLD, _HOLD_FREE)[self._component]
 
-    def _rotations(self, vertices: Floats) -> Floats:
-        """Rotations (V, 3, 3) of the neighbourhoods from rest to `vertices`."""
+    def _rotations(self, vertices: Floats, edge: Floats | None = None) -> Floats:
+        """Rotations (V, 3, 3) of the neighbourhoods to `vertices`, from rest or from these edges."""
+        rest = self._edge if edge is None else edge
         now = vertices[self._i] - vertices[self._j]
-        product = self._w[:, None, None] * now[:, :, None] * self._edge[:, None, :]
+        product = self._w[:, None, None] * now[:, :, None] * rest[:, None, :]
         flat = product.reshape(-1, 9)
         total = np.stack(
             [
@@ -291,9 +298,16 @@ class LaplacianDeformer:
         )
         return nearest_rotations((self._smooth @ total).reshape(-1, 3, 3))
 
-    def _resting(self, rotations: Floats) -> Floats:
+    def _resting(self, vertices: Floats, about: tuple[Floats, Floats] | None) -> Floats:
         """The right-hand side (V, 3) of the two stiffness terms."""
-        out: Floats = self._bending @ np.einsum("vxy,vy->vx", rotations, self._delta)
+        rotations = self._rotations(vertices)
+        turned = np.einsum("vxy,vy->vx", rotations, self._delta)
+        if about is not None:
+            shape, share = about
+            own = self._rotations(vertices, shape[self._i] - shape[self._j])
+            bent = np.einsum("vxy,vy->vx", own, self._laplacian @ shape)
+            turned += share[:, None] * (bent - turned)
+        out: Floats = self._bending @ turned
         if self._soft.any():
             between = 0.5 * (rotations[self._i] + rotations[self._j])
             pull = self._soft[:, None] * np.einsum("exy,ey->ex", between, self._edge)

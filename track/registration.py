@@ -31,6 +31,7 @@ from track.pyramid import image_pyramid
 from track.rigid import Similarity, fit_similarity
 from track.scan_depth import ScanDepth
 from track.schedule import Step
+from track.separation import Separation
 from track.sightings import Sightings
 from track.start import blended_start, place_scores
 from track.surface_model import SurfaceModel
@@ -116,6 +117,7 @@ class Registrar:
             mm: LaplacianDeformer(surface.neutral, surface.triangles, Stiffness(bending_mm=mm))
             for mm in sorted({step.bending_mm for step in options.steps})
         }
+        self._separation = Separation(surface.neutral, surface.triangles)
         self._neutral = self.reference(-1, surface.neutral, images)
 
     def reference(
@@ -196,7 +198,8 @@ class Registrar:
         for _ in range(_PULLS):  # lifting is linear about the estimate
             skin = self._surface.skin(out)
             told = [one.constraints(out, skin, self._cameras) for one in sightings]
-            out = supple.solve(Constraints.joined([held, *told]), start=out)
+            joined = Constraints.joined([held, *told])
+            out = supple.solve(joined, start=out, about=(out, np.ones(len(out))))
         return out
 
     def best_start(
@@ -325,6 +328,7 @@ class Registrar:
             samples, len(vertices), matches, list(self._cameras), lifted, (agreement, moved)
         )
         found = self._result(vertices, lifted, weights, told)
+        found = replace(found, vertices=self._separation.parted(found.vertices, found.confidence))
         return found if known.second is None else replace(found, reference=known.second.frame)
 
     def _matcher(self, second: FaceReference | None) -> Matcher:

@@ -295,3 +295,27 @@ def test_refusals() -> None:
         Stiffness(bending_mm=-1.0)
     with pytest.raises(ShapeError, match=r"triangles: indices must lie in 0\.\.3"):
         cotangent_laplacian(vertices[:4], triangles)
+
+
+def test_bending_from_another_shape_keeps_what_that_shape_has() -> None:
+    """A bump the surface already has, held nowhere, stays; from rest it is smoothed away."""
+    from tests.track.moving_patch import patch_mesh
+
+    mesh = patch_mesh()
+    bump = 3.0 * np.exp(-(mesh.vertices[:, 0] ** 2 + mesh.vertices[:, 1] ** 2) / 60.0)
+    shape = mesh.vertices + bump[:, None] * [0.0, 0.0, 1.0]
+    border = np.flatnonzero(bump < 0.01)
+    constraints = Constraints(
+        corners=np.repeat(border[:, None], 3, axis=1),
+        barycentric=np.tile([1.0, 0.0, 0.0], (len(border), 1)),
+        targets=shape[border],
+        weights=np.ones(len(border)),
+    )
+    deformer = LaplacianDeformer(mesh.vertices, mesh.triangles, Stiffness(bending_mm=2.0))
+    every = np.ones(len(shape))
+    kept = deformer.solve(constraints, start=shape, about=(shape, every))
+    smoothed = deformer.solve(constraints, start=shape)
+    half = deformer.solve(constraints, start=shape, about=(shape, 0.5 * every))
+    assert np.abs(kept - shape).max() < 1e-6  # mm
+    assert np.abs(smoothed - shape).max() > 2.0
+    assert 0.5 < np.abs(half - shape).max() < np.abs(smoothed - shape).max()

@@ -42,9 +42,7 @@ def test_truth_is_recovered_and_the_mesh_comes_home(
     folder, mesh, truth = visit
     told: list[tuple[int, int, str]] = []
     take = _take(folder, tmp_path / "take")
-    performance = track(
-        take, mesh, TrackSettings(), progress=lambda *step: told.append(step)
-    )
+    performance = track(take, mesh, TrackSettings(), progress=lambda *step: told.append(step))
     error = _error(performance.vertices.astype(float), truth)
     moved = np.linalg.norm(truth[2] - truth[0], axis=1)
     assert moved.max() > 4.0  # mm

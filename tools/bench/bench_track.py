@@ -59,7 +59,7 @@ class _Flags:
 
 
 def settings_cases() -> dict[str, TrackSettings]:
-    """Settings to compare by name: each switch of the stage off, and some numbers changed."""
+    """Settings to compare by name: each switch of the stage turned, and some numbers changed."""
     base = TrackSettings()
     changes: dict[str, dict[str, Any]] = {
         "three rounds at full resolution": {"passes": 3},
@@ -70,10 +70,10 @@ def settings_cases() -> dict[str, TrackSettings]:
         "windows of 15 px": {"half_window_px": 7},
     }
     for each in fields(base):
-        if getattr(base, each.name) is True:
-            changes[f"without {each.name.removeprefix('use_').replace('_', ' ')}"] = {
-                each.name: False
-            }
+        value = getattr(base, each.name)
+        if isinstance(value, bool):
+            words = each.name.removeprefix("use_").replace("_", " ")
+            changes[f"{'without' if value else 'with'} {words}"] = {each.name: not value}
     known = {each.name for each in fields(base)}
     cases = {"default": base}
     for words, change in changes.items():

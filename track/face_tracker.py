@@ -25,6 +25,7 @@ from track.features_follow import FeatureFollower, lost_skin
 from track.flow_backend import make_flow
 from track.frame_store import TrackedFrame
 from track.head_motion import damped_motion, head_motion
+from track.landmark_stage import stored_sightings
 from track.pyramid import level_count
 from track.registration import FrameAids, FrameResult, Registrar, RegistrarOptions
 from track.schedule import schedule
@@ -203,13 +204,17 @@ class FaceTracker:
         result = registrar.register(start, images, aids)
         found = self._stored(frame, result, began)
         lost = lost_skin(registrar.surface, result.confidence, registrar.vertex_views())
-        if not lost.any() or self._follower is None:
+        if not lost.any():
             return found
-        held: Bools = result.confidence > _FIXED
-        moved = self._follower.follow(result.vertices, images, wanted=lost, held=held)
-        return self._blended(
-            found, self._stored(frame, registrar.register(moved, images, aids), began)
-        )
+        told = tuple(stored_sightings(self._take, self._neutral, frame))
+        if self._follower is None and not told:
+            return found
+        moved = result.vertices
+        if self._follower is not None:
+            held: Bools = result.confidence > _FIXED
+            moved = self._follower.follow(moved, images, wanted=lost, held=held)
+        sought = registrar.register(moved, images, replace(aids, sightings=aids.sightings + told))
+        return self._blended(found, self._stored(frame, sought, began), lost)
 
     def _second(self, before: Sequence[TrackedFrame]) -> FaceReference | None:
         """Whom to ask about skin that the neutral does not tell of any more, if there is such skin.
@@ -250,11 +255,17 @@ class FaceTracker:
         weak: Bools = poor & (share > 0.5 * total)
         return weak
 
-    def _blended(self, one: TrackedFrame, other: TrackedFrame) -> TrackedFrame:
-        """Two solves of a frame, each where it is surer, with soft seams along the surface."""
+    def _blended(
+        self, one: TrackedFrame, other: TrackedFrame, where: Bools | None = None
+    ) -> TrackedFrame:
+        """Two solves of a frame, each where it is surer, with soft seams along the surface.
+
+        With `where` (V,) the second is taken nowhere but there.
+        """
         ring = self._ring()
         gain = other.confidence.astype(np.float64) - one.confidence
-        share = (ring @ (gain > _GAIN).astype(np.float64) > 0.0).astype(np.float64)
+        wins = (gain > _GAIN) if where is None else (gain > _GAIN) & where
+        share = (ring @ wins.astype(np.float64) > 0.0).astype(np.float64)
         for _ in range(3):
             share = ring @ share
         mixed = one.vertices + share[:, None] * (other.vertices.astype(np.float64) - one.vertices)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -48,6 +48,16 @@ class Performance:
                 f"polygons: indices must be below the {self.vertices.shape[1]} vertices, "
                 f"found {int(self.polygons.max())}"
             )
+
+    def stabilised(self) -> Performance:
+        """The same with the head held still: every frame moved back to the neutral's place.
+
+        Its `head_from_neutral` is the one that was taken out, so that nothing is lost.
+        """
+        turned = self.head_from_neutral[:, :3, :3]
+        away = self.vertices - self.head_from_neutral[:, None, :3, 3]
+        still = np.einsum("fvx,fxy->fvy", away, turned).astype(np.float32)
+        return replace(self, vertices=still)
 
 
 def read_performance(path: Path) -> Performance:

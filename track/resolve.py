@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from capture.arrays import Bools
-from track.corrections.blend import blend, blend_confidence, interpolate
+from track.corrections.blend import blend, blend_confidence, ease_to_held, interpolate
 from track.corrections.replay import Corrections
 from track.face_tracker import FaceTracker
 from track.frame_store import FrameStore, TrackedFrame
@@ -123,7 +123,7 @@ def corrected(
     found: Mapping[int, TrackedFrame],
     solved: Mapping[int, TrackedFrame],
     corrections: Corrections,
-    ease_frames: int,
+    settings: ResolveSettings,
 ) -> list[TrackedFrame]:
     """The performance with its corrections: eased in, locked frames exact, excluded ones filled.
 
@@ -132,8 +132,9 @@ def corrected(
         found: as tracked, by frame.
         solved: frames solved again.
         corrections: what is said of the take.
-        ease_frames: see `track.corrections.blend.blend_weights`.
+        settings: how far corrections reach; locked frames draw those around along as far.
     """
+    ease_frames = settings.ease_frames
     base = [found[frame] for frame in frames]
     anew: Bools = np.array([frame in solved for frame in frames])
     other = [solved.get(frame, found[frame]) for frame in frames]
@@ -141,10 +142,15 @@ def corrected(
     new = _stacked(other)
     vertices = blend(old[0], new[0], anew, ease_frames)
     confidence = blend_confidence(old, new, anew, ease_frames)
+    held: dict[int, NDArray[np.float32]] = {}
     for index, frame in enumerate(frames):
-        locked = corrections.for_frame(frame).locked
-        if locked is not None:
-            vertices[index], confidence[index] = locked.vertices, locked.confidence
+        said = corrections.for_frame(frame)
+        if said.locked is not None:
+            held[index], confidence[index] = said.locked.vertices, said.locked.confidence
+        elif said.sightings and frame in solved:
+            held[index] = vertices[index]
+    if corrections.locked:
+        vertices = ease_to_held(vertices, held, settings.reach_frames)
     gone = set(corrections.excluded)
     known: Bools = np.array([frame not in gone for frame in frames])
     if gone and known.any():

@@ -3,6 +3,7 @@
 ::
 
     TAKE/products/track/performance.npz      the product
+    TAKE/products/track/stabilised.npz       the same in the neutral's head space
     TAKE/products/track/report.json          figures by frame
     TAKE/products/track/quality.npz, .csv    quality by frame and vertex; see track/quality_report
     TAKE/products/track/anchors.json         where the take was cut
@@ -35,6 +36,7 @@ from track.face_tracker import FaceTracker
 from track.frame_store import FrameStore, TrackedFrame
 from track.head_motion import head_motion
 from track.landmark_file import Landmarks, read_landmarks
+from track.landmark_stage import stored_hash
 from track.performance import Performance, read_performance, write_performance
 from track.quality_report import write_quality_report
 from track.resolve import ResolveSettings, corrected, resolve, runs_of
@@ -108,13 +110,14 @@ def track(
     store = FrameStore(plan.folder / "corrected", dict.fromkeys(run, record), len(neutral.vertices))
     counted = _Counter(progress, len(run), "correct")
     solved = resolve(tracker, found, corrections, run, store, counted)
-    final = corrected(frames, found, solved, corrections, settings.correction_ease)
+    final = corrected(frames, found, solved, corrections, reach)
     performance, report = _assemble(neutral, frames, final)
     report["anchors"] = list(anchors)
     report["solved_again"] = list(run)
     evidence, cameras = [result.evidence for result in final], take.cameras()
     told = write_quality_report(plan.folder, neutral, performance, evidence, cameras, plan.scans)
     write_performance(out, performance)
+    write_performance(out.with_name("stabilised.npz"), performance.stabilised())
     with replacing(out.with_name("report.json")) as partial:
         partial.write_text(json.dumps(told.joined(report), indent=1) + "\n", encoding="utf-8")
     write_record(out, record)
@@ -130,12 +133,16 @@ class _Plan:
         self.scans = _scans(take) if settings.use_scan else {}
         shape = hashlib.sha256(neutral.vertices.tobytes() + neutral.polygons.tobytes()).hexdigest()
         self._inputs = {"take": take.input_hash(), "neutral": shape}
-        self._hashes = {frame: hash_file(path) for frame, path in self.scans.items()}
+        self._hashes = {
+            frame: f"{hash_file(self.scans[frame]) if frame in self.scans else 'none'} "
+            f"{stored_hash(take, frame)}"
+            for frame in take.frames
+        }
 
     def record(self, what: str, frames: Sequence[int]) -> dict[str, Any]:
-        """The record of a product of these frames: their scans, and the first frame's."""
+        """The record of a product of these frames: their scans and landmarks, and the first's."""
         first = self.take.frames[0]
-        told = "\n".join(f"{f} {self._hashes.get(f, '')}" for f in [first, *frames])
+        told = "\n".join(f"{f} {self._hashes[f]}" for f in [first, *frames])
         digest = hashlib.sha256(told.encode()).hexdigest()
         return stage_record("track", self.settings, {**self._inputs, what: digest})
 
@@ -162,6 +169,17 @@ class _Plan:
         """Where the anchors are kept."""
         records = {frame: self.record("anchor", [frame]) for frame in anchors}
         return FrameStore(self.folder / "frames", records, len(self.neutral.vertices))
+
+    def corrected_store(self, corrections: Corrections, run: Mapping[int, int]) -> FrameStore:
+        """Where frames that were solved again are kept: each hangs on what its own run is told."""
+        records = {}
+        for frame, source in run.items():
+            keys = "\n".join(f"{f} {corrections.key(f)}" for f, s in run.items() if s == source)
+            record = self.record("scans", self.take.frames)
+            record["inputs"]["corrections"] = hashlib.sha256(keys.encode()).hexdigest()
+            record["inputs"]["from"] = str(source)
+            records[frame] = record
+        return FrameStore(self.folder / "corrected", records, len(self.neutral.vertices))
 
 
 class _Counter:

@@ -15,7 +15,7 @@ import tyro
 from capture.progress import Progress
 from capture.take import Take
 from recon.mesh import read_obj
-from tools.verbs.options import Options
+from tools.verbs.options import Options, parse_frames
 from track.stage import TrackSettings, track
 
 REQUIRED = ("take", "neutral")
@@ -31,6 +31,10 @@ class Arguments(Options):
     """The neutral in tracking topology, registered to the first frame, OBJ, world mm."""
     landmarks: Path | None = None
     """Hand marks of the first frame, JSON: the neutral is laid rigidly onto them."""
+    frames: str | None = None
+    """A:B (B excluded): solve these frames again with their corrections, blended at the ends."""
+    workers: int = 1
+    """Processes that follow parts of a long take side by side."""
     settings: Annotated[TrackSettings, tyro.conf.arg(name="")] = field(
         default_factory=TrackSettings
     )
@@ -39,11 +43,17 @@ class Arguments(Options):
 def run(arguments: Arguments, progress: Progress) -> dict[str, Any]:
     """Track and report frames, vertices and mean confidence."""
     take = Take.open(arguments.take)
+    again: tuple[int, int] | None = None
+    if arguments.frames is not None:
+        chosen = parse_frames(arguments.frames, take.frames)
+        again = (chosen[0], chosen[-1])
     performance = track(
         take,
         read_obj(arguments.neutral),
         arguments.settings,
         landmarks=arguments.landmarks,
+        again=again,
+        workers=arguments.workers,
         progress=progress,
     )
     return {

@@ -283,7 +283,7 @@ class LaplacianDeformer:
         return np.where(held > 0.0, _HOLD, _HOLD_FREE)[self._component]
 
     def _rotations(self, vertices: Floats, edge: Floats | None = None) -> Floats:
-        """Rotations (V, 3, 3) of the neighbourhoods to `vertices`, from rest or from these edges."""
+        """Rotations (V, 3, 3) of the neighbourhoods to `vertices`, from rest or these edges."""
         rest = self._edge if edge is None else edge
         now = vertices[self._i] - vertices[self._j]
         product = self._w[:, None, None] * now[:, :, None] * rest[:, None, :]

@@ -268,6 +268,9 @@ class FaceTracker:
         share = (ring @ wins.astype(np.float64) > 0.0).astype(np.float64)
         for _ in range(3):
             share = ring @ share
+        first, second = (1.0 - share) * one.confidence, share * other.confidence
+        total = first + second
+        share = np.divide(second, total, out=(share > 0.0).astype(np.float64), where=total > 0.0)
         mixed = one.vertices + share[:, None] * (other.vertices.astype(np.float64) - one.vertices)
         sure = one.confidence + share * gain
         return replace(

@@ -1,6 +1,7 @@
 """The tracking stage on a small synthetic take: truth, round trip, bytes, resuming, errors."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from capture.take import Take
 from recon.mesh import Mesh
 from recon.visiting import import_take
 from tests.track.moving_patch import patch_mesh, write_patch_visit
+from track.face_tracker import FaceTracker
 from track.performance import read_performance
 from track.stage import TrackSettings, track
 
@@ -86,6 +88,53 @@ def test_same_bytes_twice_and_after_an_interruption(
     assert (place / "performance.npz").stat().st_mtime_ns == stamp  # current: skipped
     stored = read_performance(place / "performance.npz")
     np.testing.assert_array_equal(again.vertices, stored.vertices)
+
+
+def test_segments_in_processes_of_their_own_give_the_same_bytes(tmp_path: Path) -> None:
+    source = tmp_path / "visit"
+    mesh, truth = write_patch_visit(source, [0.0, 0.6, 0.0, 0.8, 0.0])
+    one, two = _take(source, tmp_path / "one"), _take(source, tmp_path / "two")
+    alone = track(one, mesh, TrackSettings())
+    track(two, mesh, TrackSettings(), workers=2)
+    products = [take.products / "track" for take in (one, two)]
+    assert json.loads((products[0] / "report.json").read_text())["anchors"] == [0, 2, 4]
+    for name in ("performance.npz", "stabilised.npz", "quality.npz"):
+        assert (products[0] / name).read_bytes() == (products[1] / name).read_bytes()
+    assert np.median(_error(alone.vertices.astype(float), truth)) < 0.05  # mm
+
+
+def test_the_stabilised_performance_holds_the_head_still(
+    visit: tuple[Path, Mesh, Floats], tmp_path: Path
+) -> None:
+    folder, mesh, _ = visit
+    take = _take(folder, tmp_path / "take")
+    performance = track(take, mesh, TrackSettings())
+    still = read_performance(take.products / "track" / "stabilised.npz")
+    head = performance.head_from_neutral
+    back = np.einsum("fxy,fvy->fvx", head[:, :3, :3], still.vertices) + head[:, None, :3, 3]
+    assert np.abs(back - performance.vertices).max() < 1e-3  # mm: float32
+    with pytest.raises(SettingsError, match=r"workers: expected 1\.\.64, found 0"):
+        track(take, mesh, TrackSettings(), workers=0)
+
+
+def test_skin_that_was_lost_is_found_from_the_other_side(
+    visit: tuple[Path, Mesh, Floats], tmp_path: Path
+) -> None:
+    folder, mesh, truth = visit
+    tracker = FaceTracker(_take(folder, tmp_path / "take"), mesh, TrackSettings(), {})
+    right = tracker.direct(4, mesh.vertices)
+    good = tracker.follow(3, [right])
+    away = np.linalg.norm(mesh.vertices[:, :2], axis=1) < 18.0  # mm around the middle
+    lost = replace(
+        good,
+        vertices=good.vertices + np.where(away, 4.0, 0.0).astype(np.float32)[:, None],
+        confidence=np.where(away, 0.0, good.confidence).astype(np.float32),
+    )
+    found = tracker.again(3, lost, [right])
+    before, after = (_error(one.vertices[None].astype(float), truth[3:4]) for one in (lost, found))
+    assert before.max() > 5.0
+    assert after.max() < 0.5  # mm
+    assert tracker.again(3, good, [right]) is good  # nothing to be gained
 
 
 def test_other_settings_do_not_use_old_frames(

@@ -158,7 +158,7 @@ class FaceTracker:
         doubted = (found.evidence.views_open >= _MIN_VIEWS) & (found.confidence < _UNSURE)
         better = doubted & (after[-1].confidence > found.confidence + _GAIN)
         open_skin = max(int((found.evidence.views_open >= _MIN_VIEWS).sum()), 1)
-        if better.sum() < _DOUBTED * open_skin:
+        if not self._settings.second_look or better.sum() < _DOUBTED * open_skin:
             return found
         began = time.perf_counter()
         images = self._images(frame)
@@ -392,4 +392,5 @@ def _options(
         search_stride=settings.search_stride,
         rotation_iterations=settings.rotation_iterations,
         threads=threads,
+        contact=settings.contact,
     )

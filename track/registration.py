@@ -328,7 +328,9 @@ class Registrar:
             samples, len(vertices), matches, list(self._cameras), lifted, (agreement, moved)
         )
         found = self._result(vertices, lifted, weights, told)
-        found = replace(found, vertices=self._separation.parted(found.vertices, found.confidence))
+        if self._options.contact:
+            parted = self._separation.parted(found.vertices, found.confidence)
+            found = replace(found, vertices=parted)
         return found if known.second is None else replace(found, reference=known.second.frame)
 
     def _matcher(self, second: FaceReference | None) -> Matcher:
@@ -425,6 +427,7 @@ class RegistrarOptions:
         search_stride: in the first round every how manieth sample is matched.
         rotation_iterations: updates of the local frames in each solve.
         threads: over the views; 0: as many as there are processors. Results do not depend on it.
+        contact: whether surfaces that crossed are pushed apart at the end.
     """
 
     steps: tuple[Step, ...]
@@ -433,6 +436,7 @@ class RegistrarOptions:
     search_stride: int
     rotation_iterations: int
     threads: int = 0
+    contact: bool = True
 
     def __post_init__(self) -> None:
         if not self.steps:

@@ -198,6 +198,8 @@ def _cut(
 ) -> dict[int, Floats]:
     """The anchors, and where the head puts the neutral (V, 3) in each."""
     path, frames = plan.folder / "anchors.json", plan.take.frames
+    if not plan.settings.anchors and not wanted:
+        return {frames[0]: plan.neutral.vertices.astype(np.float64)}
     record = plan.record("anchors", ())
     if not is_current(path, record):
         start, rows = plan.neutral.vertices.astype(np.float64), []
@@ -220,6 +222,8 @@ def _cut(
     heads = {int(row["frame"]): np.array(row["head"]) for row in rows}
     rest = plan.neutral.vertices.astype(np.float64)
     placed = {frame: rest @ head[:3, :3].T + head[:3, 3] for frame, head in heads.items()}
+    if not plan.settings.anchors:
+        unrest_mm = dict.fromkeys(unrest_mm, float("inf"))
     return {frame: placed.get(frame, rest) for frame in choose_anchors(unrest_mm, wanted)}
 
 

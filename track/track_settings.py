@@ -29,6 +29,9 @@ class TrackSettings:
         use_scan: use the scans that `likeness recon` made. The first frame's tells how far the
             skin lies over the neutral, which matters where the neutral is not quite on it; that
             of any other frame the depth of skin that one or two views alone see there.
+        anchors: register frames that show the neutral directly, and cut the take there.
+        second_look: look again, from the far end of a segment, at what the first sweep lost.
+        contact: push crossed lips and lids apart.
         features: look by sparse features for skin that moved farther than flow searches.
         second_reference: match skin that looks unlike the neutral to a nearer frame as well.
         flow: who measures dense flow, "cpu" or "gpu"; both give the same within rounding.
@@ -49,6 +52,9 @@ class TrackSettings:
     rotation_iterations: int = 2
     extrapolation: float = 0.7
     use_scan: bool = True
+    anchors: bool = True
+    second_look: bool = True
+    contact: bool = True
     features: bool = True
     second_reference: bool = False
     flow: Literal["cpu", "gpu"] = "cpu"

@@ -45,6 +45,7 @@ _LEANS = 0.5  # share of a vertex's matches that were to a second reference
 _WORTH = 12  # badly matched vertices that are worth a second reference
 _AROUND = 2  # rings: what counts as a region, and how far a second reference reaches beyond it
 _FIXED = 0.5  # confidence of skin that features need not move
+_RETURN_PX = 0.5  # how far a match may miss its way back
 _FEATURES_PX = 256  # least side of the level that features are found at
 _GAIN = 0.1  # confidence that a second solve must add to be taken
 
@@ -393,4 +394,5 @@ def _options(
         rotation_iterations=settings.rotation_iterations,
         threads=threads,
         contact=settings.contact,
+        return_px=_RETURN_PX if settings.follow_back else np.inf,
     )

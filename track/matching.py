@@ -19,6 +19,7 @@ from track.guide import GuidedView
 from track.lift import Lifted, Observations, merged, triangulate
 from track.observe import believable, observe
 from track.reference import ReferenceLevel
+from track.round_trip import return_miss
 from track.scan_depth import ScanDepth, depth_observations
 from track.schedule import Step
 from track.surface_model import SurfaceModel
@@ -39,12 +40,14 @@ class RoundImages:
             pixels one of its pixels spans; empty when nothing is known to be hidden.
         depth: the frame's scan, where it is wanted.
         stride: every how manieth sample is matched.
+        last: whether this is the frame's last round, whose matches are followed back.
     """
 
     views: Mapping[str, Floats32]
     occluders: Mapping[str, tuple[Floats32, float]]
     depth: ScanDepth | None
     stride: int
+    last: bool = False
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -58,6 +61,7 @@ class Matcher:
         min_correlation: least NCC believed.
         pool: threads over the views; the kernels let go of the interpreter.
         flow: who warps, searches and refines.
+        return_px: a match that misses its way back by more is not believed; inf: none is tried.
     """
 
     surface: SurfaceModel
@@ -66,6 +70,7 @@ class Matcher:
     min_correlation: float
     pool: ThreadPoolExecutor
     flow: FlowBackend
+    return_px: float = np.inf
 
     def measure(
         self, step: Step, vertices: Floats, seen: RoundImages
@@ -130,6 +135,9 @@ class Matcher:
         view = self.flow.warp(level, self.surface.triangles, skin, image, hidden)
         matches = self._match(step, level, (view, image), chosen)
         believed = believable(matches, self.min_correlation, step.limit_px)
+        if seen.last and self.return_px < np.inf:
+            miss = return_miss(level, view, matches, believed, step.iterations)
+            believed &= ~(miss > self.return_px)
         told = observe(level, view, matches, points, believed)
         return view_matches(level, view, matches.correlation, told)
 

@@ -317,6 +317,7 @@ class Registrar:
                 },
                 depth=depth,
                 stride=1 if index > 0 else self._options.search_stride,
+                last=index == len(self._options.steps) - 1,
             )
             lifted, matches = matcher.measure(step, vertices, seen)
             before = vertices
@@ -341,6 +342,7 @@ class Registrar:
             min_correlation=self._options.min_correlation,
             pool=self._pool,
             flow=self._flow,
+            return_px=self._options.return_px,
         )
 
     def _depth(self, name: str, vertices: Floats) -> tuple[Floats32, float]:
@@ -428,6 +430,7 @@ class RegistrarOptions:
         rotation_iterations: updates of the local frames in each solve.
         threads: over the views; 0: as many as there are processors. Results do not depend on it.
         contact: whether surfaces that crossed are pushed apart at the end.
+        return_px: of the last round, how far a match may miss its way back.
     """
 
     steps: tuple[Step, ...]
@@ -437,6 +440,7 @@ class RegistrarOptions:
     rotation_iterations: int
     threads: int = 0
     contact: bool = True
+    return_px: float = np.inf
 
     def __post_init__(self) -> None:
         if not self.steps:

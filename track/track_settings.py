@@ -29,6 +29,7 @@ class TrackSettings:
         use_scan: use the scans that `likeness recon` made. The first frame's tells how far the
             skin lies over the neutral, which matters where the neutral is not quite on it; that
             of any other frame the depth of skin that one or two views alone see there.
+        follow_back: match the last round both ways, and drop what does not lead home.
         anchors: register frames that show the neutral directly, and cut the take there.
         second_look: look again, from the far end of a segment, at what the first sweep lost.
         contact: push crossed lips and lids apart.
@@ -52,6 +53,7 @@ class TrackSettings:
     rotation_iterations: int = 2
     extrapolation: float = 0.7
     use_scan: bool = True
+    follow_back: bool = True
     anchors: bool = True
     second_look: bool = True
     contact: bool = True

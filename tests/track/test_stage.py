@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 
 from capture.arrays import Floats
-from capture.errors import CameraError, SettingsError, TakeError
+from capture.errors import CameraError, SettingsError, TakeError, WorkError
 from capture.pose import Pose
 from capture.take import Take
 from recon.mesh import Mesh
 from recon.visiting import import_take
 from tests.track.moving_patch import patch_mesh, write_patch_visit
 from track.face_tracker import FaceTracker
+from track.flow_backend import make_flow
 from track.performance import read_performance
 from track.stage import TrackSettings, track
 
@@ -135,6 +136,19 @@ def test_skin_that_was_lost_is_found_from_the_other_side(
     assert before.max() > 5.0
     assert after.max() < 0.5  # mm
     assert tracker.again(3, good, [right]) is good  # nothing to be gained
+
+
+def test_the_graphics_card_finds_the_same_mesh(tmp_path: Path) -> None:
+    try:
+        make_flow("gpu")
+    except WorkError as error:
+        pytest.skip(f"no compute shaders here: {error}")
+    source = tmp_path / "visit"
+    mesh, _ = write_patch_visit(source, [0.0, 0.7])
+    one, two = _take(source, tmp_path / "one"), _take(source, tmp_path / "two")
+    alone = track(one, mesh, TrackSettings())
+    other = track(two, mesh, TrackSettings(flow="gpu"))
+    assert np.abs(alone.vertices - other.vertices).max() < 0.005  # mm
 
 
 def test_other_settings_do_not_use_old_frames(

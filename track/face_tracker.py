@@ -83,7 +83,7 @@ class FaceTracker:
             TakeError: when fewer than two views show it.
         """
         began = time.perf_counter()
-        registrar = self._registrar()
+        registrar = self.registrar()
         confidence = registrar.vertex_views()
         if not confidence.any():
             names = ", ".join(self._cameras.names)
@@ -118,15 +118,15 @@ class FaceTracker:
             (V, 3) the neutral, moved with this frame's head; and how far some region of the seen
             skin has left it, mm. The start and inf for a frame of fewer than two views.
         """
-        images = self._images(frame)
+        images = self.images(frame)
         if len(images) < _MIN_VIEWS:
             return start, float("inf")
-        return self._registrar().scout(start, images)
+        return self.registrar().scout(start, images)
 
     def direct(self, frame: int, start: Floats) -> TrackedFrame:
         """Register a frame from the neutral, moved with the head (V, 3): nothing is handed on."""
         began = time.perf_counter()
-        images = self._images(frame)
+        images = self.images(frame)
         if len(images) < _MIN_VIEWS:
             return self._stored(frame, FrameResult.lost(start, len(self._cameras)), began)
         return self._found(frame, start, images, self._aids(frame), began)
@@ -135,10 +135,10 @@ class FaceTracker:
         """Register a frame, beginning where the ones before it (the last is nearest) lead."""
         began = time.perf_counter()
         start = self._predict(before)
-        images = self._images(frame)
+        images = self.images(frame)
         if len(images) < _MIN_VIEWS:
             return self._stored(frame, FrameResult.lost(start, len(self._cameras)), began)
-        registrar = self._registrar()
+        registrar = self.registrar()
         sure = before[-1].confidence.astype(np.float64)
         starts = [registrar.carried(start, sure), *self._other_starts(start, before)]
         begin = registrar.best_start(starts, sure, images)
@@ -162,8 +162,8 @@ class FaceTracker:
         if not self._settings.second_look or better.sum() < _DOUBTED * open_skin:
             return found
         began = time.perf_counter()
-        images = self._images(frame)
-        registrar = self._registrar()
+        images = self.images(frame)
+        registrar = self.registrar()
         sure = after[-1].confidence.astype(np.float64)
         mine = found.vertices.astype(np.float64)
         other = registrar.carried(self._predict(after), sure)
@@ -183,11 +183,11 @@ class FaceTracker:
         """
         frame, without = said.frame, said.excluded_views
         began = time.perf_counter()
-        images = {name: image for name, image in self._images(frame).items() if name not in without}
+        images = {name: image for name, image in self.images(frame).items() if name not in without}
         if len(images) < _MIN_VIEWS:
             return self._stored(frame, FrameResult.lost(start, len(self._cameras)), began)
         aids = replace(self._aids(frame), sightings=said.sightings)
-        registrar = self._registrar()
+        registrar = self.registrar()
         result = registrar.register(registrar.pulled(start, said.sightings), images, aids)
         assured = np.maximum(result.confidence, said.assured(len(start)))
         return self._stored(frame, replace(result, confidence=assured), began)
@@ -201,7 +201,7 @@ class FaceTracker:
         began: float,
     ) -> TrackedFrame:
         """Register a frame; what of it is lost is looked for by features, farther than flow."""
-        registrar = self._registrar()
+        registrar = self.registrar()
         result = registrar.register(start, images, aids)
         found = self._stored(frame, result, began)
         lost = lost_skin(registrar.surface, result.confidence, registrar.vertex_views())
@@ -238,8 +238,8 @@ class FaceTracker:
             only = self._weak(source) | (source.evidence.leaning > _LEANS)
             for _ in range(_AROUND):
                 only = self._ring() @ only.astype(np.float64) > 0.0
-            images, mesh = self._images(source.frame), source.vertices.astype(np.float64)
-            made = self._registrar().reference(source.frame, mesh, images, only)
+            images, mesh = self.images(source.frame), source.vertices.astype(np.float64)
+            made = self.registrar().reference(source.frame, mesh, images, only)
             self._held = (source, made)
         return self._held[1]
 
@@ -329,10 +329,15 @@ class FaceTracker:
             out.append(start + last - damped_motion(earlier, last, weights, 1.0).apply(earlier))
         return out
 
-    def _registrar(self) -> Registrar:
+    def registrar(self) -> Registrar:
+        """What registers frames to the neutral; made when it is first asked for.
+
+        Raises:
+            TakeError: when fewer than two views have the first frame.
+        """
         if self._made is None:
             first = self._take.frames[0]
-            images = self._images(first)
+            images = self.images(first)
             if len(images) < _MIN_VIEWS:
                 raise TakeError(
                     f"{self._take.folder}: frame {first} has {len(images)} of "
@@ -367,7 +372,8 @@ class FaceTracker:
     def _aids(self, frame: int) -> FrameAids:
         return FrameAids(scan=load_scan(self._scans[frame]) if frame in self._scans else None)
 
-    def _images(self, frame: int) -> dict[str, Floats32]:
+    def images(self, frame: int) -> dict[str, Floats32]:
+        """The views that a frame has, float32 mono 0..1, by device name."""
         take = self._take
         names = [name for name in take.device_names if take.present(name, frame)]
         return {name: mono(take.image(name, frame)) for name in names}

@@ -28,9 +28,10 @@ from track.laplacian import Constraints, LaplacianDeformer, Stiffness
 from track.lift import Lifted
 from track.matching import Matcher, RoundImages
 from track.pyramid import image_pyramid
-from track.rigid import Similarity, fit_similarity
+from track.rigid import fit_similarity
 from track.scan_depth import ScanDepth
 from track.schedule import Step
+from track.scout import HeadScout
 from track.separation import Separation
 from track.sightings import Sightings
 from track.start import blended_start, place_scores
@@ -41,11 +42,6 @@ _HELD = 0.8  # confidence from which skin is not looked for elsewhere in the nex
 _SINGLE_VIEW = 0.02  # weight of a sample that one view alone sees, and no scan: of unknown depth
 _HELD_WEIGHT = 0.02  # of every vertex, when what is sighted pulls the mesh
 _PULLS = 3
-_SPANNING = 30  # samples from which a rigid motion is told
-_MOTION_ROUNDS = 8
-_STILL_MM = 0.7  # skin that is this near to where the head carries it has hardly moved in it
-_GONE_MM = 3.0  # what counts for seen skin that is not found where the head carries it
-_UNREST_ROUNDS = 2  # of summing over neighbours: the size of a region
 _ENOUGH = 12  # samples that a mesh is solved for from
 _AGREED = 2  # witnesses, views or a view and the scan, that fix a sample's place
 
@@ -119,6 +115,9 @@ class Registrar:
         }
         self._separation = Separation(surface.neutral, surface.triangles)
         self._neutral = self.reference(-1, surface.neutral, images)
+        self._scout = HeadScout(
+            self._matcher(None), options.steps[:2], options.search_stride, images
+        )
 
     def reference(
         self,
@@ -236,47 +235,8 @@ class Registrar:
         return blended_start(starts, scores, samples, surface.neighbours, supple)
 
     def scout(self, start: Floats, images: Mapping[str, Floats32]) -> tuple[Floats, float]:
-        """Find the head as one rigid piece, by the two coarsest rounds.
-
-        Args:
-            start: (V, 3) the neutral, about where the head is, world mm.
-            images: the frame's images, float32 mono.
-
-        Returns:
-            (V, 3) the neutral with the head; and the unrest, mm: how far skin that two views see
-            has left it, in the region that has done so most.
-        """
-        samples = self._surface.samples
-        usable = [name for name in self._neutral.views if name in images]
-        pyramids = {name: image_pyramid(images[name], self._levels) for name in usable}
-        matcher = self._matcher(None)
-        vertices, unrest = start, np.inf
-        for step in self._options.steps[:2]:
-            views = {name: pyramids[name][step.level] for name in usable}
-            seen = RoundImages(views=views, occluders={}, depth=None, stride=1)
-            lifted, matches = matcher.measure(step, vertices, seen)
-            agreed = np.flatnonzero(lifted.views >= _AGREED)
-            if len(agreed) < _SPANNING:
-                return start, float("inf")
-            places = samples.points(vertices)
-            motion = _robust_motion(places[agreed], places[agreed] + lifted.motion[agreed])
-            vertices = motion.apply(vertices)
-            able = np.zeros(len(samples), np.int64)
-            for told in matches.values():
-                able[told.seen] += 1
-            away = np.linalg.norm(places + lifted.motion - motion.apply(places), axis=1)
-            away[lifted.views < _AGREED] = _GONE_MM
-            unrest = self._unrest(away, able >= _AGREED)
-        return vertices, unrest
-
-    def _unrest(self, away: Floats, seen: Bools) -> float:
-        """The largest mean distance (N,) of the seen samples over a region, mm."""
-        share, mean = seen.astype(np.float64), np.where(seen, away, 0.0)
-        near = self._surface.neighbours
-        for _ in range(_UNREST_ROUNDS):
-            share, mean = near @ share + share, near @ mean + mean
-        known = share > 0.5 * float(np.median(share[seen])) if seen.any() else seen
-        return float((mean[known] / share[known]).max()) if known.any() else float("inf")
+        """Find the head as one rigid piece, and how far the face has left it: `HeadScout.find`."""
+        return self._scout.find(start, images)
 
     def register(
         self, start: Floats, images: Mapping[str, Floats32], aids: FrameAids | None = None
@@ -445,17 +405,6 @@ class RegistrarOptions:
     def __post_init__(self) -> None:
         if not self.steps:
             raise SettingsError("steps: expected at least one")
-
-
-def _robust_motion(before: Floats, after: Floats) -> Similarity:
-    """The rigid motion that most points (n, 3) follow."""
-    weights = np.ones(len(before))
-    for _ in range(_MOTION_ROUNDS):
-        motion = fit_similarity(before, after, weights)
-        away: Floats = np.linalg.norm(motion.apply(before) - after, axis=1)
-        scale = max(_STILL_MM, float(np.median(away)))
-        weights = 1.0 / (1.0 + (away / scale) ** 2) ** 2
-    return motion
 
 
 def _agreement(

@@ -6,9 +6,9 @@ TAKE is a visiting take with cameras.json and neutral.obj. Each vertex that a vi
 frame is followed by `cv2.calcOpticalFlowPyrLK` from the first frame to every other one, beginning
 where the last frame had it; a match that does not return to its start is dropped. Vertices are
 triangulated from all views robustly, and one Laplacian solve a frame, reweighted where vertices
-leave it, carries the rest. Windows, limits and stiffness are a compromise of about 25 settings tried
-between takes/dev-smile and the photographed head (`tools.bench.moving_head`): none was best on both.
-Of our tracking it uses the triangulation, the solver and the visibility.
+leave it, carries the rest. Windows, limits and stiffness are a compromise of about 25 settings
+tried on takes/dev-smile and the photographed head (`tools.bench.moving_head`): none was best on
+both. Of our tracking it uses the triangulation, the solver and the visibility.
 """
 
 from __future__ import annotations

@@ -165,7 +165,7 @@ def _extended(
     return not np.isnan(around[0, 0, 0]) and not np.isnan(around[-1, -1, 0])
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, forceinline=True)
 def _shown(image: Any, guided: Any, around: Any, corner: Any, window: Any, shown: Any) -> bool:
     """What the frame shows at those places; False where they leave the image."""
     left, top, margin = corner

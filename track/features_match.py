@@ -254,7 +254,7 @@ def _candidates(
     return number
 
 
-@numba.njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "nsz"})
+@numba.njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "nsz"}, forceinline=True)
 def _distance(one: Any, two: Any) -> Any:
     """Squared Euclidean distance of two descriptors."""
     total = np.float32(0.0)

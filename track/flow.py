@@ -24,7 +24,10 @@ _MIN_PIXELS = 20
 _MAX_STEP_PX = 1.0
 _DONE_PX = 0.005
 ALIGNED = 0.85  # correlation at which a sample needs no search: refinement will do
-_FAST = {"reassoc", "contract", "arcp", "nsz"}  # sums may be reordered: they fill vector lanes
+# Sums may be reordered: they fill vector lanes. What is compiled so, and what calls it below a
+# kernel, is inlined by force: of a callee that is not, two copies that were optimised apart exist,
+# and which of them runs hangs on whether the kernel came from the cache.
+_FAST = {"reassoc", "contract", "arcp", "nsz"}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -164,7 +167,7 @@ def _inside(image: Any, x0: int, y0: int, margin: int, patch: Any) -> bool:
     return across and y0 - margin >= 0 and y0 + rows + margin <= image.shape[0]
 
 
-@numba.njit(cache=True, fastmath=_FAST)
+@numba.njit(cache=True, fastmath=_FAST, forceinline=True)
 def correlation_at(patch: Any, image: Any, x0: int, y0: int) -> float:
     """Weighted NCC of a template with the image at one whole-pixel place."""
     mean = square = cross = np.float32(0.0)
@@ -217,7 +220,7 @@ def _refine(
     return found, score, information
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, forceinline=True)
 def descend(
     image: Any, patch: Any, scratch: Any, corner: Any, start: Any, iterations: int, out: Any
 ) -> float:
@@ -248,7 +251,7 @@ def descend(
     return score
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, forceinline=True)
 def template(
     reference: Any, solid: Any, window: Any, corner: Any, shift: Any, weights: Any, patch: Any
 ) -> bool:
@@ -280,7 +283,7 @@ def template(
     return _normalise(patch, np.float32(total), np.float32(mean / total))  # type: ignore[no-any-return]
 
 
-@numba.njit(cache=True, fastmath=_FAST)
+@numba.njit(cache=True, fastmath=_FAST, forceinline=True)
 def _normalise(patch: Any, total: float, mean: float) -> bool:
     """Make weights sum to 1, values zero-mean and unit; take mean and gain out of the gradients."""
     rows, columns = patch.shape[1], patch.shape[2]
@@ -309,7 +312,7 @@ def _normalise(patch: Any, total: float, mean: float) -> bool:
     return True
 
 
-@numba.njit(cache=True, fastmath=_FAST)
+@numba.njit(cache=True, fastmath=_FAST, forceinline=True)
 def _hessian(patch: Any) -> tuple[float, float, float]:
     xx = xy = yy = np.float32(0.0)
     for j in range(patch.shape[1]):
@@ -321,7 +324,7 @@ def _hessian(patch: Any) -> tuple[float, float, float]:
     return float(xx), float(xy), float(yy)
 
 
-@numba.njit(cache=True, fastmath=_FAST)
+@numba.njit(cache=True, fastmath=_FAST, forceinline=True)
 def _shifted(image: Any, x0: int, y0: int, dx: float, dy: float, lines: Any, values: Any) -> bool:
     """The window of `image` at a fractional shift, Catmull-Rom; False outside the image."""
     height, width = image.shape
@@ -345,7 +348,7 @@ def _shifted(image: Any, x0: int, y0: int, dx: float, dy: float, lines: Any, val
     return True
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, forceinline=True)
 def _cubic(t: Any) -> tuple[Any, Any, Any, Any]:
     """Catmull-Rom weights of the four neighbours at fraction t, float32."""
     half, one, two = np.float32(0.5), np.float32(1.0), np.float32(2.0)
@@ -357,7 +360,7 @@ def _cubic(t: Any) -> tuple[Any, Any, Any, Any]:
     )
 
 
-@numba.njit(cache=True, fastmath=_FAST)
+@numba.njit(cache=True, fastmath=_FAST, forceinline=True)
 def _residual(patch: Any, values: Any) -> tuple[float, float, float]:
     """NCC, and the steepest descent images times the normalised difference."""
     mean = square = cross = bx = by = np.float32(0.0)

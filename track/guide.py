@@ -126,7 +126,7 @@ def _warp(
     return out, place, solid
 
 
-@numba.njit(cache=True, fastmath={"reassoc", "contract", "nsz"})
+@numba.njit(cache=True, fastmath={"reassoc", "contract", "nsz"}, forceinline=True)
 def interpolated(image: Any, u: float, v: float) -> Any:
     """Catmull-Rom interpolation of the sixteen pixels around (u, v)."""
     left, top = int(u), int(v)

@@ -53,7 +53,7 @@ class TrackSettings:
     rotation_iterations: int = 2
     extrapolation: float = 0.7
     use_scan: bool = True
-    follow_back: bool = True
+    follow_back: bool = False
     anchors: bool = True
     second_look: bool = True
     contact: bool = True

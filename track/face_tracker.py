@@ -131,11 +131,19 @@ class FaceTracker:
             return self._stored(frame, FrameResult.lost(start, len(self._cameras)), began)
         return self._found(frame, start, images, self._aids(frame), began)
 
-    def follow(self, frame: int, before: Sequence[TrackedFrame]) -> TrackedFrame:
-        """Register a frame, beginning where the ones before it (the last is nearest) lead."""
+    def follow(
+        self, frame: int, before: Sequence[TrackedFrame], without: frozenset[str] = frozenset()
+    ) -> TrackedFrame:
+        """Register a frame, beginning where others lead.
+
+        Args:
+            frame: which.
+            before: finished frames on one side of it; the last is nearest.
+            without: views not to look at.
+        """
         began = time.perf_counter()
         start = self._predict(before)
-        images = self.images(frame)
+        images = self.images(frame, without)
         if len(images) < _MIN_VIEWS:
             return self._stored(frame, FrameResult.lost(start, len(self._cameras)), began)
         registrar = self.registrar()
@@ -181,9 +189,9 @@ class FaceTracker:
             start: (V, 3) where to begin, world mm.
             said: pins, curves, and views not to look at.
         """
-        frame, without = said.frame, said.excluded_views
+        frame = said.frame
         began = time.perf_counter()
-        images = {name: image for name, image in self.images(frame).items() if name not in without}
+        images = self.images(frame, said.excluded_views)
         if len(images) < _MIN_VIEWS:
             return self._stored(frame, FrameResult.lost(start, len(self._cameras)), began)
         aids = replace(self._aids(frame), sightings=said.sightings)
@@ -372,11 +380,11 @@ class FaceTracker:
     def _aids(self, frame: int) -> FrameAids:
         return FrameAids(scan=load_scan(self._scans[frame]) if frame in self._scans else None)
 
-    def images(self, frame: int) -> dict[str, Floats32]:
-        """The views that a frame has, float32 mono 0..1, by device name."""
+    def images(self, frame: int, without: frozenset[str] = frozenset()) -> dict[str, Floats32]:
+        """The views that a frame has but for some, float32 mono 0..1, by device name."""
         take = self._take
-        names = [name for name in take.device_names if take.present(name, frame)]
-        return {name: mono(take.image(name, frame)) for name in names}
+        names = [name for name in take.device_names if name not in without]
+        return {name: mono(take.image(name, frame)) for name in names if take.present(name, frame)}
 
 
 def _options(

@@ -111,7 +111,7 @@ def resolve(
                 step = 1 if frame > source else -1
                 behind = [f for f in sorted(solved, reverse=step < 0) if (frame - f) * step > 0]
                 chain = [solved[f] for f in behind if (f - source) * step >= 0]
-                kept = tracker.follow(frame, chain)
+                kept = tracker.follow(frame, chain, what.excluded_views)
             store.save(frame, kept)
         solved[frame] = kept
         told(frame)

@@ -107,7 +107,7 @@ def track(
     tracker = FaceTracker(take, neutral, settings, plan.scans)
     anchors = _cut(plan, tracker, corrections.anchors, progress)
     found = _follow(plan, tracker, anchors, workers, progress)
-    store = FrameStore(plan.folder / "corrected", dict.fromkeys(run, record), len(neutral.vertices))
+    store = plan.corrected_store(corrections, run, list(anchors))
     counted = _Counter(progress, len(run), "correct")
     solved = resolve(tracker, found, corrections, run, store, counted)
     final = corrected(frames, found, solved, corrections, reach)
@@ -170,14 +170,23 @@ class _Plan:
         records = {frame: self.record("anchor", [frame]) for frame in anchors}
         return FrameStore(self.folder / "frames", records, len(self.neutral.vertices))
 
-    def corrected_store(self, corrections: Corrections, run: Mapping[int, int]) -> FrameStore:
-        """Where frames that were solved again are kept: each hangs on what its own run is told."""
+    def corrected_store(
+        self, corrections: Corrections, run: Mapping[int, int], anchors: Sequence[int]
+    ) -> FrameStore:
+        """Where frames that were solved again are kept: each hangs on what its own run is told.
+
+        It begins from the frames as tracked, which hang on where the take was cut.
+        """
+        runs: dict[int, list[str]] = {}
+        for frame, source in run.items():
+            runs.setdefault(source, [f"from {source}, cut at {list(anchors)}"]).append(
+                f"{frame} {corrections.key(frame)}"
+            )
         records = {}
         for frame, source in run.items():
-            keys = "\n".join(f"{f} {corrections.key(f)}" for f, s in run.items() if s == source)
             record = self.record("scans", self.take.frames)
+            keys = "\n".join(runs[source])
             record["inputs"]["corrections"] = hashlib.sha256(keys.encode()).hexdigest()
-            record["inputs"]["from"] = str(source)
             records[frame] = record
         return FrameStore(self.folder / "corrected", records, len(self.neutral.vertices))
 
@@ -185,8 +194,8 @@ class _Plan:
 class _Counter:
     """Tells progress of frames that are done in any order."""
 
-    def __init__(self, progress: Progress, total: int, what: str, done: int = 0) -> None:
-        self._progress, self._total, self._what, self._done = progress, total, what, done
+    def __init__(self, progress: Progress, total: int, what: str) -> None:
+        self._progress, self._total, self._what, self._done = progress, total, what, 0
 
     def __call__(self, frame: int) -> None:
         self._done += 1

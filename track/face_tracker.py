@@ -31,7 +31,6 @@ from track.registration import FrameAids, FrameResult, Registrar, RegistrarOptio
 from track.schedule import schedule
 from track.skin import skin_heights
 from track.surface_model import SurfaceModel
-from track.surface_samples import vertex_rings
 from track.track_settings import TrackSettings
 
 _MIN_VIEWS = 2
@@ -216,12 +215,12 @@ class FaceTracker:
         if not lost.any():
             return found
         told = tuple(stored_sightings(self._take, self._neutral, frame))
-        if self._follower is None and not told:
+        if not self._settings.features and not told:
             return found
         moved = result.vertices
-        if self._follower is not None:
+        if self._settings.features:
             held: Bools = result.confidence > _FIXED
-            moved = self._follower.follow(moved, images, wanted=lost, held=held)
+            moved = self._features().follow(moved, images, wanted=lost, held=held)
         sought = registrar.register(moved, images, replace(aids, sightings=aids.sightings + told))
         return self._blended(found, self._stored(frame, sought, began), lost)
 
@@ -233,6 +232,8 @@ class FaceTracker:
         is still known there; and it stays so until it matches badly itself, or until the region
         matches the neutral again. So few links lie between any frame and the neutral.
         """
+        if not self._settings.second_reference:
+            return None
         last = before[-1]
         weak = self._weak(last)
         source: TrackedFrame | None = None
@@ -240,7 +241,7 @@ class FaceTracker:
             source = last
         elif last.reference >= 0 and bool((last.evidence.leaning > _LEANS).any()):
             source = next((b for b in before if b.frame == last.reference), None)
-        if source is None or not self._settings.second_reference:
+        if source is None:
             return None
         if self._held is None or self._held[0] is not source:
             only = self._weak(source) | (source.evidence.leaning > _LEANS)
@@ -292,7 +293,7 @@ class FaceTracker:
     def _ring(self) -> sparse.csr_matrix:
         """Means over the vertices next to each (V, V)."""
         if self._smooth is None:
-            near = vertex_rings(self._neutral.triangles, len(self._neutral.vertices), 1)
+            near = self.registrar().surface.near
             count = np.asarray(near.sum(axis=1)).ravel()
             self._smooth = sparse.csr_matrix(sparse.diags(1.0 / np.maximum(count, 1.0)) @ near)
         return self._smooth
@@ -359,14 +360,22 @@ class FaceTracker:
             options = _options(self._settings, self._cameras, mesh, self._threads)
             flow = make_flow(self._settings.flow)
             self._made = Registrar(surface, cameras, images, options, flow)
-            if self._settings.features:
-                skin = surface.skin(surface.neutral)
-                known = FeatureReference(skin, surface.triangles, cameras, images)
-                sizes = [(camera.width, camera.height) for camera in cameras.values()]
-                levels = min(level_count(*size, _FEATURES_PX) for size in sizes)
-                rounds = feature_rounds(max(0, levels - 1))
-                self._follower = FeatureFollower(surface, known, rounds)
         return self._made
+
+    def _features(self) -> FeatureFollower:
+        """Finds lost skin; made when some is lost for the first time."""
+        if self._follower is None:
+            surface = self.registrar().surface
+            cameras = {camera.name: camera for camera in self._cameras}
+            known = FeatureReference(
+                surface.skin(surface.neutral), surface.triangles, cameras,
+                self.images(self._take.frames[0]),
+            )  # fmt: skip
+            sizes = [(camera.width, camera.height) for camera in self._cameras]
+            levels = min(level_count(*size, _FEATURES_PX) for size in sizes)
+            rounds = feature_rounds(max(0, levels - 1))
+            self._follower = FeatureFollower(surface, known, rounds)
+        return self._follower
 
     def _heights(self) -> Floats | None:
         """How far the first frame's scan lies over the neutral, where there is such a scan."""

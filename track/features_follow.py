@@ -6,10 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy import sparse
 from scipy.sparse import csgraph
 
-from capture.arrays import Bools, Floats, Floats32, Ints32, check_shape
+from capture.arrays import Bools, Floats, Floats32, check_shape
 from track.features import (
     FeatureReference,
     FeatureRound,
@@ -126,25 +125,15 @@ def lost_skin(
         (V,) the vertices of such regions; none when nothing is lost.
     """
     check_shape(confidence=(confidence, "V"), seen=(seen, "V"))
-    joined = _joined(surface.triangles, len(confidence))
     area = vertex_areas(surface.neutral, surface.triangles)
     visible = seen >= 1.0
     weight = np.where(visible, area, 0.0)
     mixed = weight * (confidence < _LOST)
     for _ in range(_AVERAGING):
-        weight, mixed = joined @ weight + weight, joined @ mixed + mixed
+        weight, mixed = surface.near @ weight, surface.near @ mixed
     own = np.flatnonzero(visible & (mixed > _MOST_LOST * weight))
-    _, region = csgraph.connected_components(joined[own][:, own], directed=False)
+    _, region = csgraph.connected_components(surface.near[own][:, own], directed=False)
     size = np.bincount(region, area[own], minlength=1)
     lost = np.zeros(len(confidence), np.bool_)
     lost[own[size[region] >= least_mm2]] = True
     return lost
-
-
-def _joined(triangles: Ints32, count: int) -> sparse.csr_matrix:
-    """Which vertices (V, V) share an edge, as ones."""
-    ends = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
-    one_way = sparse.csr_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), (count, count))
-    both = sparse.csr_matrix(one_way + one_way.T)
-    both.data[:] = 1.0
-    return both

@@ -25,6 +25,7 @@ class SurfaceModel:
         heights_mm: (V,) how far the skin lies over the mesh, along its normals; None: on it.
             What views show is the skin, b + h n; what is solved for is the mesh, b.
         samples: N points that views are matched at.
+        near: (V, V) which vertices share an edge, or are one: ones.
         rings: (V, V) which vertices belong to one piece of surface.
         neighbours: (N, N) which samples lie around the same vertices.
         raster: draws the mesh.
@@ -34,6 +35,7 @@ class SurfaceModel:
     triangles: Ints32
     heights_mm: Floats | None
     samples: SurfaceSamples
+    near: sparse.csr_matrix
     rings: sparse.csr_matrix
     neighbours: sparse.csr_matrix
     raster: Rasterizer
@@ -44,13 +46,15 @@ class SurfaceModel:
     ) -> SurfaceModel:
         """Spread samples over a neutral (V, 3), at most `spacing_mm` apart."""
         samples = sample_surface(neutral, triangles, spacing_mm)
+        near = vertex_rings(triangles, len(neutral), 1)
         return cls(
             neutral=neutral,
             triangles=triangles,
             heights_mm=heights_mm,
             samples=samples,
+            near=near,
             rings=vertex_rings(triangles, len(neutral), _RINGS),
-            neighbours=_neighbour_matrix(samples, triangles, len(neutral)),
+            neighbours=_neighbour_matrix(samples, near),
             raster=Rasterizer(triangles, len(neutral)),
         )
 
@@ -75,15 +79,13 @@ class SurfaceModel:
         return mean
 
 
-def _neighbour_matrix(
-    samples: SurfaceSamples, triangles: Ints32, vertex_count: int
-) -> sparse.csr_matrix:
+def _neighbour_matrix(samples: SurfaceSamples, near: sparse.csr_matrix) -> sparse.csr_matrix:
     """Which samples lie around the same vertices, (N, N) csr of ones without the diagonal."""
     rows = np.arange(len(samples))
     own = samples.corners[rows, samples.barycentric.argmax(axis=1)]
-    pick = sparse.csr_matrix((np.ones(len(rows)), (rows, own)), (len(rows), vertex_count))
-    near = pick @ vertex_rings(triangles, vertex_count, 1) @ pick.T
-    near.setdiag(0)
-    near.eliminate_zeros()
-    near.data[:] = 1.0
-    return sparse.csr_matrix(near)
+    pick = sparse.csr_matrix((np.ones(len(rows)), (rows, own)), (len(rows), near.shape[0]))
+    beside = pick @ near @ pick.T
+    beside.setdiag(0)
+    beside.eliminate_zeros()
+    beside.data[:] = 1.0
+    return sparse.csr_matrix(beside)

@@ -8,11 +8,11 @@ import numpy as np
 
 from capture.arrays import Bools, Floats, Ints32
 from capture.progress import Progress, silent
+from rig.evidence import Evidence
 from rig.gradient import gradient_operator
 from rig.template import Template
 from rig.transfer import transfer_shapes
 from rig.update import (
-    Evidence,
     UpdatePriors,
     mean_vertex_area,
     offset_stiffness,

@@ -11,6 +11,7 @@ from scipy import sparse
 
 from capture.arrays import Bools, Floats, Ints, Ints32, check_shape
 from capture.errors import SolveError
+from rig.evidence import Evidence
 from rig.gradient import gradient_operator
 from rig.ranges import run_ranges
 from rig.transfer import factorised
@@ -68,21 +69,6 @@ class UpdateSystem:
     blocks: Floats
     laplacian: sparse.csr_array
     right: Floats
-
-
-@dataclass(frozen=True, eq=False)
-class Evidence:
-    """Frames brought back to rig space, with what is known of them.
-
-    Attributes:
-        offsets: (F, V, 3) points minus the neutral, head motion undone, mm.
-        confidence: (F, V) 0..1, squared inside.
-        weights: (F, B).
-    """
-
-    offsets: Floats
-    confidence: Floats
-    weights: Floats
 
 
 def update_shapes(
@@ -160,7 +146,7 @@ def assemble(
     position = np.full(active.shape, -1, dtype=np.int64)
     position[active] = np.arange(len(columns))
     block_starts = np.concatenate([[0], np.cumsum(counts**2)]).astype(np.int64)
-    factors = np.concatenate([np.ones((len(evidence.weights), 1)), evidence.weights], axis=1)
+    factors = evidence.factors
     residual = evidence.offsets - np.tensordot(evidence.weights, targets, axes=1)
     stiffness = offset_stiffness(targets, priors)[active]
     square = np.asarray(evidence.confidence, dtype=np.float64) ** 2

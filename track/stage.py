@@ -19,7 +19,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -280,13 +280,11 @@ def _side_by_side(
     workers: int,
     told: Callable[[int], None],
 ) -> None:
-    """Sweep segments in processes of their own; each reads the take for itself."""
-    folder, neutral, settings = plan.take.folder, plan.neutral, plan.settings
-    pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn"))
+    """Sweep segments in processes of their own; each reads the take, and makes ready, once."""
+    given = (plan.take.folder, plan.neutral, plan.settings)
+    pool = ProcessPoolExecutor(workers, get_context("spawn"), _SweepProcess.begin, given)
     try:
-        jobs = {
-            pool.submit(_sweep_alone, folder, neutral, settings, p, dict(ends)): p for p in parts
-        }
+        jobs = {pool.submit(_SweepProcess.sweep, part, _ends(part, ends)): part for part in parts}
         for job in as_completed(jobs):
             job.result()
             for frame in jobs[job].frames:
@@ -295,16 +293,27 @@ def _side_by_side(
         pool.shutdown(cancel_futures=True)
 
 
-def _sweep_alone(
-    folder: Path,
-    neutral: Mesh,
-    settings: TrackSettings,
-    part: Segment,
-    ends: dict[int, TrackedFrame],
-) -> None:
-    plan = _Plan(Take.open(folder), neutral, settings)
-    tracker = FaceTracker(plan.take, neutral, settings, plan.scans, threads=1)
-    sweep(tracker, part, ends, plan.stores(part), lambda frame: None)
+def _ends(part: Segment, anchors: Mapping[int, TrackedFrame]) -> dict[int, TrackedFrame]:
+    """The anchors at a segment's ends."""
+    return {frame: anchors[frame] for frame in (part.left, part.right) if frame is not None}
+
+
+class _SweepProcess:
+    """What a process of `_side_by_side` keeps from one segment to the next."""
+
+    _plan: ClassVar[_Plan]
+    _tracker: ClassVar[FaceTracker]
+
+    @classmethod
+    def begin(cls, folder: Path, neutral: Mesh, settings: TrackSettings) -> None:
+        """Open the take; called once, when the process starts."""
+        cls._plan = _Plan(Take.open(folder), neutral, settings)
+        cls._tracker = FaceTracker(cls._plan.take, neutral, settings, cls._plan.scans, threads=1)
+
+    @classmethod
+    def sweep(cls, part: Segment, ends: dict[int, TrackedFrame]) -> None:
+        """Follow one segment; its frames are left in the stores."""
+        sweep(cls._tracker, part, ends, cls._plan.stores(part), lambda frame: None)
 
 
 def _frames(take: Take) -> tuple[int, ...]:

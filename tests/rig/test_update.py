@@ -6,9 +6,9 @@ from scipy import sparse
 from scipy.sparse.linalg import spsolve
 
 from capture.errors import SolveError
+from rig.evidence import Evidence
 from rig.gradient import gradient_operator
 from rig.update import (
-    Evidence,
     UpdatePriors,
     assemble,
     mean_vertex_area,

@@ -23,12 +23,12 @@ from scipy.optimize import lsq_linear
 from scipy.sparse.linalg import spsolve
 
 from capture.arrays import Floats
+from rig.evidence import Evidence
 from rig.gradient import gradient_operator
 from rig.neutral_frame import align_frame
 from rig.stage import RigSettings, solve_rig
 from rig.template import Template, read_template
 from rig.update import (
-    Evidence,
     UpdatePriors,
     mean_vertex_area,
     offset_stiffness,

@@ -30,7 +30,7 @@ bench: setup ## every benchmark; those on real takes want the folder SHARED
 	$(PYTHON) -m tools.bench.bench_actor
 	$(PYTHON) -m tools.bench.bench_calibrate --seeds 1
 	$(PYTHON) -m tools.bench.bench_mcap
-	$(PYTHON) -m tools.bench.bench_rig
+	$(PYTHON) -m tools.bench.rig speed --shared $(SHARED)
 	$(PYTHON) -m tools.bench.bench_neutral
 	$(PYTHON) -m tools.bench.bench_landmarks $(SHARED)/takes/dev-smile --frames 0 3 6 11
 	$(PYTHON) -m tools.bench.bench_stereo $(SHARED)/takes/dev-smile 0 --score $(SHARED)/tools/score_scan.py

@@ -3,96 +3,44 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
 
-from capture.arrays import Bools, Floats, Ints32
+from capture.arrays import Floats
 from capture.progress import Progress, silent
 from rig.evidence import Evidence
+from rig.fit import Fit, Iteration, Observations, undo_motion, weighted_rms
+from rig.gauge import choose_scales, resting_weights, shape_sizes
 from rig.gradient import gradient_operator
+from rig.locality import Locality, Mask, mask_shapes
+from rig.neutral_frame import rigid_weights
+from rig.overrides import Override, override_evidence, widened_support
 from rig.template import Template
 from rig.transfer import transfer_shapes
-from rig.update import (
-    UpdatePriors,
-    mean_vertex_area,
-    offset_stiffness,
-    update_shapes,
-)
-from rig.weights import WeightPriors, place_heads, solve_weights, sum_frames
+from rig.transfer_rbf import WarpSettings, transfer_shapes_rbf
+from rig.update import UpdatePriors, mean_vertex_area, offset_stiffness, update_shapes
+from rig.weights import WeightLinks, WeightPriors, place_heads, solve_weights, sum_frames
+
+__all__ = [
+    "Fit",
+    "Iteration",
+    "Observations",
+    "Problem",
+    "Schedule",
+    "Solution",
+    "personalise",
+    "pose_frames",
+    "pose_problem",
+    "shape_mask",
+    "transferred",
+    "weighted_rms",
+]
 
 _NOISE_FLOOR_MM = 0.05  # what tracking is never better than
 _RETRANSFER_MM = 0.05  # root mean square move of the neutral that makes the transfer stale
-
-
-@dataclass(frozen=True, eq=False)
-class Observations:
-    """Every frame of every performance, in order.
-
-    Attributes:
-        points: (F, V, 3) float64 world, mm; 0 where confidence is 0.
-        confidence: (F, V) float64 0..1.
-        contiguous: (F,) whether each frame follows the one before it in the same take.
-        weights: (F, B) where they are known beforehand, or None.
-    """
-
-    points: Floats
-    confidence: Floats
-    contiguous: Bools
-    weights: Floats | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class Fit:
-    """A rig and how it poses every frame.
-
-    Attributes:
-        neutral: (V, 3) rig space, mm.
-        deltas: (B, V, 3) mm.
-        weights: (F, B).
-        motions: (F, 4, 4) head_from_rig.
-    """
-
-    neutral: Floats
-    deltas: Floats
-    weights: Floats
-    motions: Floats
-
-    def residuals(self, points: Floats) -> Floats:
-        """Distance of each vertex of each frame from points (F, V, 3): (F, V), mm."""
-        out = np.empty(points.shape[:2])
-        for frame, motion in enumerate(self.motions):
-            posed = self.neutral + np.tensordot(self.weights[frame], self.deltas, axes=1)
-            away = posed @ motion[:3, :3].T + motion[:3, 3] - points[frame]
-            out[frame] = np.linalg.norm(away, axis=1)
-        return out
-
-
-@dataclass(frozen=True)
-class Iteration:
-    """One turn of the alternation, in summed squared mm except where the unit is named.
-
-    Attributes:
-        data: E_g, confidence-weighted.
-        gradient: lambda_r E_r.
-        offset: lambda_d E_d.
-        rms_mm: confidence-weighted root mean square residual.
-        worst_mm: largest residual of a vertex with confidence.
-        worst_vertex: its number.
-        worst_frame: the frame it is in.
-    """
-
-    data: float
-    gradient: float
-    offset: float
-    rms_mm: float
-    worst_mm: float
-    worst_vertex: int
-    worst_frame: int
-
-    @property
-    def total(self) -> float:
-        """The energy that both half-steps lower."""
-        return self.data + self.gradient + self.offset
+_RELAXING = 0.8  # of the strict evidence is asked in the next turn
+_LOOSE_UPPER = 1.5  # bound of weights between turns: the gauge, not the box, sets a shape's size
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,28 +48,84 @@ class Schedule:
     """How long to alternate, and with which priors.
 
     Attributes:
+        transfer: how the template's shapes are carried to the actor's neutral.
         iterations: most turns.
         relative_change: of the total energy, below which it stops.
+        strict_evidence: what a shape must explain to be active in the first turn; it falls to
+            `weights.evidence` by a fifth a turn.
+        rescale: whether each shape's size against its weights is chosen anew at every turn.
+        mask: kind of locality.
         mask_tolerance: of a shape's extent, below which the template holds a vertex still.
-        variation: how far the actor's shapes depart from the transferred ones, as a share of their
-            own displacement. With the residual for noise it sets `relative_mm2` of the shapes
-            step, anew at every turn.
+        size_variation: how far the sizes of the actor's shapes depart from the template's, as a
+            share.
+        variation: how far their forms depart from the transferred ones, as a share of their own
+            displacement. With the residual for noise it sets `relative_mm2` of the shapes step,
+            anew at every turn.
         weights: priors of the weights step.
         update: priors of the shapes step.
     """
 
-    iterations: int = 6
+    transfer: Literal["gradient", "rbf"] = "gradient"
+    iterations: int = 8
     relative_change: float = 0.005
+    strict_evidence: float = 0.6
+    rescale: bool = True
+    mask: Literal["vertex", "soft", "literal"] = "vertex"
     mask_tolerance: float = 1e-3
-    variation: float = 0.2
+    size_variation: float = 0.25
+    variation: float = 0.15
     weights: WeightPriors = field(default_factory=WeightPriors)
     update: UpdatePriors = field(default_factory=UpdatePriors)
 
+    def posing(self, turn: int) -> WeightPriors:
+        """Priors of the weights step after `turn` updates of the shapes."""
+        strict = self.strict_evidence * _RELAXING**turn
+        evidence = max(self.weights.evidence, strict) if self.weights.evidence > 0.0 else 0.0
+        return replace(self.weights, evidence=evidence)
 
-def weighted_rms(residuals: Floats, confidence: Floats) -> float:
-    """Root mean square of residuals (F, V), mm, weighted by squared confidence (F, V)."""
-    square = confidence**2
-    return float(np.sqrt((square * residuals**2).sum() / max(float(square.sum()), 1e-300)))
+    def relaxed(self, turn: int) -> bool:
+        """Whether the priors stay as they are from this turn on."""
+        return self.posing(turn).evidence <= self.weights.evidence
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Problem:
+    """What a personalisation starts from.
+
+    Attributes:
+        template: shapes that all move something.
+        seen: the frames.
+        schedule: when to stop, and priors.
+        overrides: shapes as the artist wants them.
+        links: symmetric and exclusive shapes.
+        rigid: whether the template's rigid vertices place the head alone.
+    """
+
+    template: Template
+    seen: Observations
+    schedule: Schedule
+    overrides: tuple[Override, ...] = ()
+    links: WeightLinks = field(default_factory=WeightLinks)
+    rigid: bool = False
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Solution:
+    """What a personalisation found.
+
+    Attributes:
+        first: the fit of the transferred template on the approximate neutral.
+        fit: of the refined rig.
+        turns: of the alternation.
+        targets: (B, V, 3) the template's shapes transferred to the refined neutral, mm.
+        relative_mm2: strength that `variation` came to in the last turn.
+    """
+
+    first: Fit
+    fit: Fit
+    turns: list[Iteration]
+    targets: Floats
+    relative_mm2: float
 
 
 def pose_frames(
@@ -139,99 +143,194 @@ def pose_frames(
     return Fit(neutral, deltas, weights, motions)
 
 
-def personalise(
-    template: Template,
-    neutral: Floats,
-    seen: Observations,
-    schedule: Schedule,
-    progress: Progress = silent,
-) -> tuple[Fit, Fit, list[Iteration]]:
+def pose_problem(
+    problem: Problem,
+    shapes: tuple[Floats, Floats],
+    priors: WeightPriors,
+    start: Floats | None = None,
+) -> Fit:
+    """The same with the problem's links and rigid vertices, for shapes (neutral, deltas)."""
+    neutral, deltas = shapes
+    seen = problem.seen
+    rigid = rigid_weights(problem.template, np.ones(len(neutral))) if problem.rigid else None
+    sums = sum_frames(neutral, deltas, seen.points, seen.confidence, rigid)
+    if seen.weights is not None:
+        return Fit(neutral, deltas, seen.weights, place_heads(sums, seen.weights))
+    weights, motions = solve_weights(sums, seen.contiguous, priors, start, problem.links)
+    return Fit(neutral, deltas, weights, motions)
+
+
+def shape_mask(problem: Problem) -> Mask:
+    """Where each shape may move: by the template, and where an override says so."""
+    schedule, template = problem.schedule, problem.template
+    mask = mask_shapes(template, Locality(mode=schedule.mask, tolerance=schedule.mask_tolerance))
+    support = widened_support(mask.support, problem.overrides, template.names)
+    return replace(mask, support=support)
+
+
+def transferred(template: Template, neutral: Floats, schedule: Schedule) -> Floats:
+    """The template's shapes (B, V, 3) on another neutral, by the schedule's kind of transfer."""
+    if schedule.transfer == "rbf":
+        return transfer_shapes_rbf(
+            template, neutral, WarpSettings(tolerance=schedule.mask_tolerance)
+        )
+    return transfer_shapes(template, neutral, schedule.mask_tolerance)
+
+
+def personalise(problem: Problem, neutral: Floats, progress: Progress = silent) -> Solution:
     """Transfer the template, then alternate weights with shapes until the energy settles.
 
     The targets D* belong to the neutral they were made on: they are made again once the neutral has
-    moved from there. The gradient operator is rebuilt on the current neutral at every update.
+    moved from there. The gradient operator is rebuilt on the current neutral at every update. What
+    the data cannot tell, a shape's size against its weights and where a shape rests, is fixed
+    before each update (`rig.gauge`).
 
     Args:
-        template: shapes that all move something.
+        problem: template, frames and priors.
         neutral: (V, 3) the actor's approximate neutral in template space, mm.
-        seen: the frames.
-        schedule: when to stop, and priors.
         progress: told after each turn.
-
-    Returns:
-        the fit of the transferred template, the fit of the refined rig, and each turn.
 
     References:
         Ma et al. 2016, section 3.
     """
-    support = template.support(schedule.mask_tolerance)
-    triangles = template.mesh.triangles
-    targets = transfer_shapes(template, neutral, schedule.mask_tolerance)
-    first = pose_frames(neutral, targets, seen, schedule.weights)
-    fit, carried, turns = first, neutral, list[Iteration]()
+    schedule = problem.schedule
     progress(0, schedule.iterations, "rig")
+    work = _Alternation(problem, neutral)
     for turn in range(schedule.iterations):
-        evidence = Evidence(_undo_motion(fit, seen), seen.confidence, fit.weights)
-        priors = _priors(schedule, weighted_rms(fit.residuals(seen.points), seen.confidence))
-        neutral, deltas = update_shapes(
-            fit.neutral, triangles, targets, support, evidence, priors, fit.deltas
-        )
-        start = neutral - fit.neutral
-        turns.append(_measure(fit, (neutral, deltas, start), targets, seen, priors, triangles))
-        fit = pose_frames(neutral, deltas, seen, schedule.weights, fit.weights)
+        work.update()
         progress(turn + 1, schedule.iterations, "rig")
-        settled = len(turns) > 1 and (
-            abs(turns[-2].total - turns[-1].total) <= schedule.relative_change * turns[-1].total
-        )
-        if settled or turn + 1 == schedule.iterations:
+        if turn + 1 == schedule.iterations or work.settled():
             break
-        if _distance_rms(neutral, carried) > _RETRANSFER_MM:
-            targets = transfer_shapes(template, neutral, schedule.mask_tolerance)
-            carried = neutral
+        work.pose(schedule.posing(turn + 1))
     progress(schedule.iterations, schedule.iterations, "rig")
-    return first, fit, turns
+    return work.finish()
 
 
-def _priors(schedule: Schedule, rms_mm: float) -> UpdatePriors:
-    """Bayes' shrinkage: variance of the noise, per coordinate, over that of the departure."""
-    noise_mm2 = max(rms_mm, _NOISE_FLOOR_MM) ** 2 / 3.0
-    return replace(schedule.update, relative_mm2=noise_mm2 / schedule.variation**2)
+class _Alternation:
+    """The state of the alternation between its steps."""
+
+    def __init__(self, problem: Problem, neutral: Floats) -> None:
+        schedule = problem.schedule
+        names = problem.template.names
+        self._problem, self._schedule = problem, schedule
+        self._mask = shape_mask(problem)
+        self._held = np.isin(names, [item.name for item in problem.overrides])
+        self._artist = override_evidence(problem.overrides, names) if self._held.any() else None
+        self._triangles = problem.template.mesh.triangles
+        self._carried = neutral
+        self._original = self._transferred(neutral)
+        self._targets = self._original
+        self._first = pose_problem(problem, (neutral, self._original), schedule.weights)
+        self._fit = self._first
+        self._turns: list[Iteration] = []
+        self._relative_mm2 = 0.0
+        if problem.seen.weights is None:
+            self.pose(schedule.posing(0))
+
+    def update(self) -> None:
+        """Fix what the data leave open, then solve the neutral and all shapes."""
+        problem, fit = self._problem, self._fit
+        if len(self._turns) > 0 and _rms(fit.neutral - self._carried) > _RETRANSFER_MM:
+            sizes = shape_sizes(self._targets, self._original)
+            self._carried = fit.neutral
+            self._original = self._transferred(fit.neutral)
+            self._targets = self._original * sizes[:, None, None]
+        if problem.seen.weights is None and self._schedule.rescale:
+            fit = self._fix_gauge(fit)
+        priors = self._priors(fit)
+        evidence = Evidence(undo_motion(fit, problem.seen), problem.seen.confidence, fit.weights)
+        if self._artist is not None:
+            evidence = evidence.with_rows(self._artist)
+        neutral, deltas = update_shapes(
+            fit.neutral,
+            self._triangles,
+            self._targets,
+            self._mask.support,
+            evidence,
+            priors,
+            fit.deltas,
+        )
+        self._fit = Fit(neutral, deltas, fit.weights, fit.motions)
+        self._relative_mm2 = priors.relative_mm2
+        self._turns.append(self._measure(fit.neutral, priors))
+
+    def pose(self, priors: WeightPriors) -> None:
+        """Solve weights and head motion, with room above 1 that the gauge takes back."""
+        rescale = self._schedule.rescale and self._problem.seen.weights is None
+        priors = replace(priors, upper=_LOOSE_UPPER) if rescale else priors
+        start = self._fit.weights
+        self._fit = pose_problem(
+            self._problem, (self._fit.neutral, self._fit.deltas), priors, start
+        )
+
+    def settled(self) -> bool:
+        """Whether the last turn changed the energy by less than asked, the priors being final."""
+        turns = self._turns
+        if len(turns) < 2 or not self._schedule.relaxed(len(turns) - 2):
+            return False
+        change = abs(turns[-2].total - turns[-1].total)
+        return change <= self._schedule.relative_change * turns[-1].total
+
+    def finish(self) -> Solution:
+        """The last weights, inside [0, 1]."""
+        fit = pose_problem(
+            self._problem, (self._fit.neutral, self._fit.deltas), self._schedule.weights,
+            self._fit.weights,
+        )  # fmt: skip
+        return Solution(
+            first=self._first, fit=fit, turns=self._turns, targets=self._original,
+            relative_mm2=self._relative_mm2,
+        )  # fmt: skip
+
+    def _transferred(self, neutral: Floats) -> Floats:
+        shapes = transferred(self._problem.template, neutral, self._schedule)
+        literal = self._mask.support.ndim == 3
+        return np.where(self._mask.support, shapes, 0.0) if literal else shapes
+
+    def _fix_gauge(self, fit: Fit) -> Fit:
+        seen = self._problem.seen
+        rest = resting_weights(fit.weights)
+        neutral = fit.neutral + np.tensordot(rest, fit.deltas, axes=1)
+        weights = np.maximum(fit.weights - rest, 0.0)
+        sizes = shape_sizes(fit.deltas, self._original)
+        scales = choose_scales(weights, seen.contiguous, sizes, self._schedule.size_variation)
+        scales[self._held] = 1.0
+        deltas = fit.deltas * scales[:, None, None]
+        self._targets = self._original * np.maximum(sizes * scales, 0.0)[:, None, None]
+        return Fit(neutral, deltas, np.minimum(weights / scales, 1.0), fit.motions)
+
+    def _priors(self, fit: Fit) -> UpdatePriors:
+        """Bayes' shrinkage: variance of the noise, per coordinate, over that of the departure."""
+        seen = self._problem.seen
+        rms_mm = weighted_rms(fit.residuals(seen.points), seen.confidence)
+        noise_mm2 = max(rms_mm, _NOISE_FLOOR_MM) ** 2 / 3.0
+        return replace(
+            self._schedule.update,
+            relative_mm2=noise_mm2 / self._schedule.variation**2,
+            extra_offset=self._mask.extra_offset,
+        )
+
+    def _measure(self, rest: Floats, priors: UpdatePriors) -> Iteration:
+        """Energies of the updated rig at the weights it was solved with; `rest` (V, 3) before."""
+        seen, fit = self._problem.seen, self._fit
+        away = np.where(seen.confidence > 0, fit.residuals(seen.points), 0.0)
+        frame, vertex = np.unravel_index(int(np.argmax(away)), away.shape)
+        operator = gradient_operator(rest, self._triangles)
+        area = mean_vertex_area(rest, self._triangles)
+        moved = np.concatenate([(fit.neutral - rest)[None], fit.deltas - self._targets])
+        change = moved.transpose(1, 0, 2)
+        bent = operator @ change.reshape(len(rest), -1)
+        stiffness = offset_stiffness(self._targets, priors)
+        return Iteration(
+            data=float(((seen.confidence * away) ** 2).sum()),
+            gradient=float((bent**2).sum()) * priors.gradient_mm2 / area,
+            offset=float((stiffness[:, :, None] * change**2).sum()),
+            rms_mm=weighted_rms(away, seen.confidence),
+            worst_mm=float(away[frame, vertex]),
+            worst_vertex=int(vertex),
+            worst_frame=int(frame),
+        )
 
 
-def _distance_rms(a: Floats, b: Floats) -> float:
-    return float(np.sqrt(((a - b) ** 2).sum(axis=1).mean()))
-
-
-def _undo_motion(fit: Fit, seen: Observations) -> Floats:
-    """Points of every frame in rig space, minus the neutral: (F, V, 3), mm."""
-    rotation, translation = fit.motions[:, :3, :3], fit.motions[:, None, :3, 3]
-    offsets: Floats = (seen.points - translation) @ rotation - fit.neutral
-    offsets[seen.confidence <= 0] = 0.0
-    return offsets
-
-
-def _measure(
-    fit: Fit,
-    updated: tuple[Floats, Floats, Floats],
-    targets: Floats,
-    seen: Observations,
-    priors: UpdatePriors,
-    triangles: Ints32,
-) -> Iteration:
-    neutral, deltas, shift = updated
-    away = Fit(neutral, deltas, fit.weights, fit.motions).residuals(seen.points)
-    away = np.where(seen.confidence > 0, away, 0.0)
-    frame, vertex = np.unravel_index(int(np.argmax(away)), away.shape)
-    operator = gradient_operator(fit.neutral, triangles)
-    area = mean_vertex_area(fit.neutral, triangles)
-    change = np.concatenate([shift[None], deltas - targets]).transpose(1, 0, 2)
-    bent = operator @ change.reshape(len(neutral), -1)
-    return Iteration(
-        data=float(((seen.confidence * away) ** 2).sum()),
-        gradient=float((bent**2).sum()) * priors.gradient_mm2 / area,
-        offset=float((offset_stiffness(targets, priors)[:, :, None] * change**2).sum()),
-        rms_mm=weighted_rms(away, seen.confidence),
-        worst_mm=float(away[frame, vertex]),
-        worst_vertex=int(vertex),
-        worst_frame=int(frame),
-    )
+def _rms(offsets: Floats) -> float:
+    return float(np.sqrt((offsets**2).sum(axis=1).mean()))

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,87 +17,24 @@ from capture.arrays import Bools, Floats
 from capture.errors import InputError, raise_all
 from capture.product import is_current, stage_record, write_record
 from capture.progress import Progress, silent
-from capture.settings import check_ranges
 from rig.face_rig import FaceRig, read_rig, write_rig
+from rig.fit import Fit, Observations, weighted_rms
+from rig.gauge import shape_sizes
+from rig.health import rig_health
+from rig.hold_out import choose_strengths
+from rig.known_weights import solve_known
+from rig.links import find_links
 from rig.neutral_frame import approximate_neutral, choose_neutral_frame
+from rig.overrides import Override, check_overrides
 from rig.report import describe_solve, write_report
-from rig.solve import (
-    Fit,
-    Observations,
-    Schedule,
-    personalise,
-    pose_frames,
-    weighted_rms,
-)
-from rig.template import Template
-from rig.update import UpdatePriors
+from rig.rig_settings import RigSettings
+from rig.solve import Problem, Solution, personalise, pose_frames
+from rig.template import Template, write_template
 from rig.weight_table import WeightTable
-from rig.weights import WeightPriors
+from rig.weights import WeightLinks, WeightPriors
 from track.performance import Performance
 
-
-@dataclass(frozen=True, kw_only=True)
-class RigSettings:
-    """Settings of the rig stage.
-
-    Attributes:
-        iterations: most turns of weights and shapes.
-        relative_change: of the total energy, below which the turns end.
-        sparsity_mm2: strength of (sum of a frame's weights)^2, as mean squared mm.
-        smoothness: strength of the change of a weight between contiguous frames, as a fraction of
-            its shape's mean squared displacement; 0 turns it off.
-        evidence: share of a frame's mean squared residual that a shape must explain to be active.
-        debias: undo the shrinking that sparsity causes, keeping its choice of shapes.
-        variation: expected departure of the actor's shapes from the transferred ones, as a share of
-            their own displacement.
-        gradient_mm2: strength of the shapes' deformation gradients against the template's.
-        offset: strength of the shapes' displacements against the template's.
-        neutral_offset: strength of the neutral against the chosen frame.
-        mask_tolerance: of a shape's extent, below which a vertex that the template holds still
-            stays still.
-        neutral_frame: which frame shows the neutral, counted over all performances; -1 chooses.
-    """
-
-    iterations: int = 5
-    relative_change: float = 0.01
-    sparsity_mm2: float = 0.01
-    smoothness: float = 0.002
-    evidence: float = 0.2
-    debias: bool = True
-    variation: float = 0.2
-    gradient_mm2: float = 1.0
-    offset: float = 0.05
-    neutral_offset: float = 0.05
-    mask_tolerance: float = 1e-3
-    neutral_frame: int = -1
-
-    def __post_init__(self) -> None:
-        check_ranges(
-            "rig", self, iterations=(1, 100), relative_change=(0.0, 1.0), sparsity_mm2=(0.0, 1e3),
-            smoothness=(0.0, 1e3), evidence=(0.0, 1.0), variation=(1e-3, 1e3),
-            gradient_mm2=(0.0, 1e6), offset=(1e-6, 1e6), neutral_offset=(1e-6, 1e6),
-            mask_tolerance=(0.0, 0.5), neutral_frame=(-1, 1_000_000),
-        )  # fmt: skip
-
-    def schedule(self) -> Schedule:
-        """The same settings as the solver takes them."""
-        return Schedule(
-            iterations=self.iterations,
-            relative_change=self.relative_change,
-            mask_tolerance=self.mask_tolerance,
-            variation=self.variation,
-            weights=WeightPriors(
-                sparsity_mm2=self.sparsity_mm2,
-                smoothness=self.smoothness,
-                evidence=self.evidence,
-                debias=self.debias,
-            ),
-            update=UpdatePriors(
-                gradient_mm2=self.gradient_mm2,
-                offset=self.offset,
-                neutral_offset=self.neutral_offset,
-            ),
-        )
+__all__ = ["RigSettings", "check_match", "observe", "solve_rig"]
 
 
 def solve_rig(
@@ -106,9 +44,13 @@ def solve_rig(
     out: Path,
     *,
     weights: WeightTable | None = None,
+    overrides: Sequence[Override] = (),
     progress: Progress = silent,
 ) -> FaceRig:
-    """Personalise a template to the performances of one actor: OUT/rig.npz and OUT/report.json.
+    """Personalise a template to the performances of one actor.
+
+    Writes OUT/rig.npz, OUT/transferred.npz (the template on the actor, before any refinement: a
+    template file) and OUT/report.json.
 
     Args:
         template: the artist's rig, mm.
@@ -116,24 +58,33 @@ def solve_rig(
         settings: strengths and when to stop.
         out: folder to write in.
         weights: where they are known beforehand, one row a frame of all performances in order.
+        overrides: shapes as the artist wants them; left out, the rig without them comes back.
         progress: told after each turn.
 
     Returns:
         the rig in the template's space; shapes that move nothing are kept as zeros, with weight 0.
 
     Raises:
-        InputError: when vertex counts, frame counts or shape names do not fit, or no vertex of
-            any frame has confidence.
+        InputError: when vertex counts, frame counts or shape names do not fit, no vertex of any
+            frame has confidence, or a method wants known weights and has none.
 
     References:
         Ma et al. 2016, Semantically-aware blendshape rigs from facial performance measurements.
     """
     started = time.monotonic()
     check_match(template, performances)
+    check_overrides(overrides, template.names, len(template.neutral))
     known = _known_weights(template, performances, weights)
+    if known is None and settings.method != "ma":
+        raise InputError(
+            f'rig.method = "{settings.method}" wants known weights (--weights W.npz); '
+            'without them only "ma" solves'
+        )
     product = Path(out) / "rig.npz"
-    record = stage_record("rig", settings, _hashes(template, performances, known))
-    if is_current(product, record) and (Path(out) / "report.json").exists():
+    inputs = _hashes(template, performances, known) | _override_hashes(overrides)
+    record = stage_record("rig", settings, inputs)
+    products = [product, Path(out) / "transferred.npz", Path(out) / "report.json"]
+    if is_current(product, record) and all(path.exists() for path in products):
         progress(1, 1, "rig")
         return read_rig(product)
     moving = template.moves()
@@ -141,15 +92,45 @@ def solve_rig(
     seen = observe(performances, None if known is None else known[:, moving])
     frame = _neutral_frame(solvable, seen, settings.neutral_frame)
     neutral = approximate_neutral(solvable, seen.points[frame], seen.confidence[frame])
-    first, fit, turns = personalise(solvable, neutral, seen, settings.schedule(), progress)
-    report = describe_solve(template, moving, seen, (first, fit), turns)
-    report |= {"neutral_frame": frame, "seconds": round(time.monotonic() - started, 3)}
-    report["best_fit"] = _best_fit(seen, first, fit)
+    problem = Problem(
+        template=solvable, seen=seen, schedule=settings.schedule(), overrides=tuple(overrides),
+        links=_links(solvable, settings), rigid=_rigid(template, settings),
+    )  # fmt: skip
+    solution, chosen = _solve(problem, neutral, settings, progress)
+    rig = _whole_rig(template, moving, solution.fit)
+    report = describe_solve(template, moving, seen, (solution.first, solution.fit), solution.turns)
+    report |= {"method": settings.method, "neutral_frame": frame}
+    report |= {"overrides": [item.name for item in overrides], "hold_out": chosen}
+    report["best_fit"] = _best_fit(seen, solution.first, solution.fit)
     report["topology_matches"] = _same_topology(template, performances)
-    write_report(Path(out) / "report.json", report)
-    write_rig(product, _whole_rig(template, moving, fit))
+    carried = _whole_deltas(template, moving, solution.targets)
+    report["health"] = rig_health(rig, template, seen=seen, transferred=carried)
+    report["seconds"] = round(time.monotonic() - started, 3)
+    write_report(products[2], report)
+    write_template(products[1], replace(template, neutral=rig.neutral, deltas=carried))
+    write_rig(product, rig)
     write_record(product, record)
     return read_rig(product)  # as a second run finds it
+
+
+def _solve(
+    problem: Problem, neutral: Floats, settings: RigSettings, progress: Progress
+) -> tuple[Solution, dict[str, Any] | None]:
+    """Solve by the method asked for; with hold-out, solve again with the strengths it chose."""
+    if settings.method != "ma":
+        return solve_known(problem, neutral, settings.method, progress), None
+    solution = personalise(problem, neutral, progress)
+    if not settings.hold_out:
+        return solution, None
+    sizes = shape_sizes(solution.fit.deltas, solution.targets)
+    scaled = solution.targets * sizes[:, None, None]
+    schedule, trials = choose_strengths(problem, solution.fit, scaled, progress)
+    chosen = {
+        "variation": schedule.variation,
+        "gradient_mm2": schedule.update.gradient_mm2,
+        "trials": [dataclasses.asdict(trial) for trial in trials],
+    }
+    return personalise(replace(problem, schedule=schedule), neutral, progress), chosen
 
 
 def check_match(
@@ -242,26 +223,37 @@ def _best_fit(seen: Observations, *fits: Fit) -> dict[str, float]:
     }
 
 
+def _links(template: Template, settings: RigSettings) -> WeightLinks:
+    found = find_links(template, settings.exclusive)
+    return found if settings.symmetry > 0.0 else replace(found, symmetric=found.symmetric[:0])
+
+
+def _rigid(template: Template, settings: RigSettings) -> bool:
+    if settings.head == "rigid" and template.rigid_vertices.size < 3:
+        raise InputError(
+            'rig.head = "rigid" wants a template with three or more rigid_vertices, this one has '
+            f'{template.rigid_vertices.size}; add them to the template, or use head = "all"'
+        )
+    return settings.head == "rigid"
+
+
 def _with_shapes(template: Template, kept: Bools) -> Template:
-    return Template(
-        neutral=template.neutral,
-        deltas=template.deltas[kept],
-        names=tuple(name for name, keep in zip(template.names, kept, strict=True) if keep),
-        polygons=template.polygons,
-        rigid_vertices=template.rigid_vertices,
-        lid_pairs=template.lid_pairs,
-        lip_pairs=template.lip_pairs,
-    )
+    names = tuple(name for name, keep in zip(template.names, kept, strict=True) if keep)
+    return replace(template, deltas=template.deltas[kept], names=names)
+
+
+def _whole_deltas(template: Template, moving: Bools, some: Floats) -> Floats:
+    deltas = np.zeros(template.deltas.shape)
+    deltas[moving] = some
+    return deltas
 
 
 def _whole_rig(template: Template, moving: Bools, fit: Fit) -> FaceRig:
-    deltas = np.zeros(template.deltas.shape)
-    deltas[moving] = fit.deltas
     weights = np.zeros((len(fit.weights), len(template.names)))
     weights[:, moving] = fit.weights
     return FaceRig(
         neutral=fit.neutral,
-        deltas=deltas,
+        deltas=_whole_deltas(template, moving, fit.deltas),
         names=template.names,
         polygons=template.polygons,
         weights=weights,
@@ -288,6 +280,15 @@ def _hashes(
     if known is not None:
         inputs["weights"] = _digest(known)
     return inputs
+
+
+def _override_hashes(overrides: Sequence[Override]) -> dict[str, str]:
+    return {
+        f"override_{item.name}": _digest(
+            np.where(item.touched[:, None], item.delta, 0.0), item.touched, np.array(item.strength)
+        )
+        for item in overrides
+    }
 
 
 def _digest(*arrays: NDArray[Any]) -> str:

@@ -8,11 +8,13 @@ from scipy.sparse.linalg import splu
 
 from capture.arrays import Bools, Floats, Ints, Ints32, check_finite, check_shape
 from rig.gradient import components, deformation_gradients, gradient_operator
+from rig.slits import polygon_edges
 from rig.template import Template
 
 MASK_TOLERANCE = 1e-3  # of a shape's own extent: below it a vertex counts as static
 _LEAK_MM = 0.03  # motion of static vertices above which a shape is solved with them held
 _SHUT_MM = 0.3  # lids or lips of the template nearer than this at rest are shut
+_DISTORTED = 5.0  # a triangle stretched more than this between the two faces tells no gradient
 _BRIDGE_STRENGTH = 10.0  # of virtual triangles against skin: closing matters more than stretch
 
 
@@ -28,6 +30,9 @@ def transfer_shapes(
     leaves none, by the template's mean displacement). A shape that would still move those
     vertices is solved again on its own, with every one of them held. Triangles spanned between
     paired lids and lips make eyes and mouth shut on the actor when they shut on the template.
+    Lids and lips that part do so by the template's millimetres: their gap at rest is no measure.
+    So is a triangle of the template that is turned over or much thinner than the actor's: there the
+    plain gradient of the template's displacements is asked for.
 
     Args:
         template: the artist's rig.
@@ -54,9 +59,15 @@ def transfer_shapes(
     labels = components(triangles, len(neutral))
     right = np.zeros((len(neutral), 3 * len(template.names)))
     transposed = operator.T.tocsr()
-    for index, delta in enumerate(template.deltas):
-        wanted = _wanted(template.neutral, np.where(support[index][:, None], delta, 0.0), triangles)
-        right[:, 3 * index : 3 * index + 3] = transposed @ (rest @ wanted).reshape(-1, 3)
+    skin = len(triangles) - len(bridges)
+    plain = _distorted(template.neutral, neutral, triangles)
+    for index, source in enumerate(template.deltas):
+        delta = np.where(support[index][:, None], source, 0.0)
+        wanted = rest @ _wanted(template.neutral, delta, triangles)
+        plain[skin:] = _parting(template.neutral, delta, bridges)
+        if plain.any():
+            wanted[plain] = (operator @ delta).reshape(-1, 3, 3)[plain]
+        right[:, 3 * index : 3 * index + 3] = transposed @ wanted.reshape(-1, 3)
     laplacian = sparse.csr_array(transposed @ operator)
     solved = _solve_anchored(laplacian, right, labels)
     deltas = np.ascontiguousarray(solved.reshape(len(neutral), -1, 3).transpose(1, 0, 2))
@@ -76,13 +87,7 @@ def virtual_triangles(template: Template) -> Ints32:
     next one's, so that one array may hold both eyes. Slits that are shut at rest, as lips mostly
     are, get none: a triangle without area has no gradient to carry, and would glue the lips.
     """
-    polygons = template.polygons
-    following = np.where(polygons[:, 3:] < 0, polygons[:, [1, 2, 0, 0]], polygons[:, [1, 2, 3, 0]])
-    ends = np.where(polygons < 0, polygons[:, :1], polygons)
-    edges = {
-        frozenset(edge)
-        for edge in zip(ends.ravel().tolist(), following.ravel().tolist(), strict=True)
-    }
+    edges = polygon_edges(template.polygons)
     found: list[tuple[int, int, int]] = []
     for pairs in (template.lid_pairs, template.lip_pairs):
         for (a, b), (c, d) in zip(pairs[:-1].tolist(), pairs[1:].tolist(), strict=True):
@@ -100,6 +105,37 @@ def _wanted(rest: Floats, delta: Floats, triangles: Ints32) -> Floats:
     gradients = deformation_gradients(rest, rest + delta, triangles[moved])
     change[moved] = (gradients - np.eye(3)).transpose(0, 2, 1)
     return change
+
+
+def _distorted(source: Floats, target: Floats, triangles: Ints32) -> Bools:
+    """Triangles turned over or stretched by far more than their surface is, or without area."""
+    edges = [points[triangles[:, 1:]] - points[triangles[:, :1]] for points in (source, target)]
+    normals = [np.cross(edge[:, 0], edge[:, 1]) for edge in edges]
+    areas = [np.linalg.norm(normal, axis=1) for normal in normals]
+    over = np.einsum("tx,tx->t", *normals) <= 0.0
+    gram = [np.einsum("tix,tjx->tij", edge, edge) for edge in edges]
+    flat = areas[0] <= 1e-12 * float(areas[0].max(initial=0.0))
+    safe = np.where(flat, 1.0, areas[0])
+    adjugate = gram[0][:, ::-1, ::-1] * np.array([[1.0, -1.0], [-1.0, 1.0]])
+    mixed = np.einsum("tij,tji->t", adjugate, gram[1]) / safe**2  # sum of squared stretches
+    product = (areas[1] / safe) ** 2
+    most = 0.5 * (mixed + np.sqrt(np.maximum(mixed**2 - 4.0 * product, 0.0)))
+    least = product / np.maximum(most, 1e-300)
+    usual = float(areas[1].sum()) / max(float(areas[0].sum()), 1e-300)
+    far = (most > usual * _DISTORTED**2) | (least < usual / _DISTORTED**2)
+    distorted: Bools = over | far | flat
+    return distorted
+
+
+def _parting(rest: Floats, delta: Floats, bridges: Ints32) -> Bools:
+    """Which triangles between lids or lips a shape makes larger."""
+    areas = []
+    for points in (rest, rest + delta):
+        corner = points[bridges]
+        normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+        areas.append(np.linalg.norm(normal, axis=1))
+    larger: Bools = areas[1] > areas[0]
+    return larger
 
 
 def _solve_anchored(laplacian: sparse.csr_array, right: Floats, labels: Ints) -> Floats:

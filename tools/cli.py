@@ -32,7 +32,10 @@ VERBS: dict[str, str] = {
     "landmarks": "find lips, lids, brows and nose in every frame, by a predictor of this actor",
     "track": "track the neutral mesh through a take",
     "correct": "pin, draw, lock or leave out what tracking is to be told",
+    "template": "carry an artist's shapes onto a mesh of other topology",
     "rig": "solve a personalised blendshape rig from performances",
+    "health": "tell what a rig can be trusted with, and what to shoot next",
+    "rename": "give shapes the names of another convention, split and merge halves",
     "export": "write a rig, a performance or weights in an exchange format",
     "report": "write the HTML report of a take",
     "verify": "read a take back and check every frame and the ledger",
@@ -46,6 +49,7 @@ _STAGES = {
     "neutral": ("track.neutral", "NeutralSettings"),
     "landmarks": ("track.landmark_stage", "LandmarkSettings"),
     "track": ("track.stage", "TrackSettings"),
+    "template": ("rig.retopology", "RetopologySettings"),
     "rig": ("rig.stage", "RigSettings"),
 }
 

@@ -31,6 +31,31 @@ def test_agrees_with_scipy_and_satisfies_kkt(decades: float) -> None:
         assert x.max() <= 1.0
 
 
+@pytest.mark.parametrize("seed", range(8))
+def test_ill_conditioned_problems_of_the_size_of_a_face(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    n, count = 51, 40
+    turn = np.linalg.qr(rng.normal(size=(n, n)))[0]
+    gram = (turn * np.logspace(0, -5, n)) @ turn.T
+    gram = (gram + gram.T) / 2
+    linear = rng.uniform(-0.5, 1.5, (count, n)) @ gram + rng.normal(0, 1e-3, (count, n))
+    low, high = np.zeros((count, n)), rng.choice([0.0, 0.5, 1.0], (count, n), p=[0.1, 0.1, 0.8])
+    solved = solve_box_qp(gram[None], linear, low, high, rng.uniform(-0.5, 1.5, (count, n)))
+    assert (solved >= low).all()
+    assert (solved <= high).all()
+    for row in range(count):
+        assert kkt_residual(gram, linear[row], (low[row], high[row]), solved[row]) <= 1e-12
+    again = solve_box_qp(gram[None], linear, low, high, solved)
+    assert np.abs(again - solved).max() <= 1e-9
+    root = np.linalg.cholesky(gram)
+    for row in range(2):
+        kept = high[row] > 0
+        right = np.linalg.solve(root, linear[row])
+        bounds = (low[row][kept], high[row][kept])
+        x = lsq_linear(root.T[:, kept], right, bounds, method="bvls", tol=1e-15, max_iter=5000).x
+        assert np.abs(solved[row][kept] - x).max() <= 1e-6
+
+
 def test_warm_start_changes_nothing_but_the_path() -> None:
     rng = np.random.default_rng(6)
     matrix, _ = _problem(rng, 40, 2.0)

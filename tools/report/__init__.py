@@ -7,6 +7,7 @@ from tools.report.report import (
     write_report,
     write_scan_page,
 )
+from tools.report.rig_page import write_rig_page
 
 __all__ = [
     "ReportInputs",
@@ -15,5 +16,6 @@ __all__ = [
     "report_for_take",
     "write_calibration_page",
     "write_report",
+    "write_rig_page",
     "write_scan_page",
 ]

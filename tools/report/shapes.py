@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
-from capture.arrays import Floats
+from capture.arrays import Bools, Floats
 from recon.mesh import Mesh
 from rig.face_rig import FaceRig
 from rig.template import Template
@@ -61,7 +62,7 @@ def rig_section(inputs: ReportInputs) -> list[Section]:
         parts.append(figure(chart, "Distance of the rig from the tracked mesh."))
     parts.append("<h3>Shapes</h3>" + thumbnails(rig, inputs.artist))
     body = "".join(parts)
-    verdicts = _verdicts(rig, inputs)
+    verdicts = rig_verdicts(rig, report)
     return [Section(anchor="rig", title="Face rig", body=body, verdicts=verdicts)]
 
 
@@ -94,9 +95,7 @@ def take_borders(inputs: ReportInputs, count: int) -> list[tuple[float, str]]:
 def thumbnails(rig: FaceRig, template: Template | None) -> str:
     """A picture of every shape at weight 1, coloured by displacement; the template's beside it."""
     size = np.linalg.norm(rig.deltas, axis=2)
-    share = size / np.maximum(size.max(axis=1, keepdims=True), 1e-9)
-    moving = share.max(axis=0, initial=0.0) > _FRAMED
-    face = moving if int(moving.sum()) > 3 else np.ones(len(rig.neutral), dtype=bool)
+    face = framed_vertices(rig.deltas)
     studio = Studio(Mesh(rig.neutral, rig.polygons))
     camera = studio_camera(rig.neutral[face], 0.25, _THUMB)
     beside = template is not None and template.deltas.shape == rig.deltas.shape
@@ -126,13 +125,21 @@ def thumbnails(rig: FaceRig, template: Template | None) -> str:
     return out
 
 
+def framed_vertices(deltas: Floats) -> Bools:
+    """Which vertices (V,) of shapes (B, V, 3) belong into a picture: those that move; else all."""
+    size = np.linalg.norm(deltas, axis=2)
+    share = size / np.maximum(size.max(axis=1, keepdims=True, initial=0.0), 1e-9)
+    moving: Bools = share.max(axis=0, initial=0.0) > _FRAMED
+    return moving if int(moving.sum()) > 3 else np.ones(deltas.shape[1], dtype=bool)
+
+
 def _tint(delta: Floats) -> Floats:
     return warm(np.linalg.norm(delta, axis=1), 0.0, _DARKEST_MM)
 
 
-def _verdicts(rig: FaceRig, inputs: ReportInputs) -> tuple[Verdict, ...]:
+def rig_verdicts(rig: FaceRig, report: Mapping[str, Any]) -> tuple[Verdict, ...]:
+    """What refinement gained, and weights outside 0..1."""
     out = []
-    report = inputs.rig_report
     if "ratio" in report:
         ratio = float(report["ratio"])
         level = "good" if ratio <= _GOOD_RATIO else "warn" if ratio <= _FAIR_RATIO else "bad"

@@ -1,6 +1,6 @@
 """Solve a personalised blendshape rig from performances.
 
-Writes DIR/rig.npz and DIR/report.json.
+Writes DIR/rig.npz, DIR/report.json and DIR/report.html, a page to look at the rig in a browser.
 Example: likeness rig --template template.npz --performance smile.npz jaw.npz --out rig
 """
 
@@ -13,14 +13,17 @@ from typing import Annotated, Any
 
 import tyro
 
+from capture.errors import WorkError
 from capture.progress import Progress
 from rig.stage import RigSettings, check_match, solve_rig
 from rig.template import read_template
 from rig.weight_table import read_weights
+from tools.report import write_rig_page
 from tools.verbs.options import Options
 from track.performance import read_performance
 
 REQUIRED = ("template", "performance", "out")
+_PLACES = {"performance", "track", "products"}  # in the path of a performance: no take's name
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,11 +38,13 @@ class Arguments(Options):
     """The folder to write."""
     weights: Path | None = None
     """Known weights of all frames, weights.npz; solved for when left out."""
+    page: bool = True
+    """Write DIR/report.html, a page that needs nothing else."""
     settings: Annotated[RigSettings, tyro.conf.arg(name="")] = field(default_factory=RigSettings)
 
 
 def run(arguments: Arguments, progress: Progress) -> dict[str, Any]:
-    """Solve and report the residuals."""
+    """Solve, draw the page, and report the residuals."""
     template = read_template(arguments.template)
     performances = [read_performance(path) for path in arguments.performance]
     check_match(template, performances, names=[str(path) for path in arguments.performance])
@@ -53,4 +58,26 @@ def run(arguments: Arguments, progress: Progress) -> dict[str, Any]:
     )
     report = json.loads((arguments.out / "report.json").read_text(encoding="utf-8"))
     plain = {k: v for k, v in report.items() if isinstance(v, str | int | float | bool)}
-    return {"rig": str(arguments.out / "rig.npz"), **plain}
+    told = {"rig": str(arguments.out / "rig.npz"), **plain}
+    if not arguments.page:
+        return told
+    page = arguments.out / "report.html"
+    try:
+        write_rig_page(
+            arguments.out,
+            template,
+            page,
+            performances=performances,
+            takes=[take_name(path) for path in arguments.performance],
+            settings=arguments.settings,
+            progress=progress,
+        )
+    except WorkError as error:  # the rig is there all the same
+        return told | {"page": f"left out: {error}"}
+    return told | {"page": str(page), "page_mb": round(page.stat().st_size / 1e6, 2)}
+
+
+def take_name(path: Path) -> str:
+    """What to call a performance by its file: its own name, or that of the take it lies in."""
+    parts = [path.stem, *(part.name for part in path.absolute().parents)]
+    return next((part for part in parts if part and part not in _PLACES), path.stem)

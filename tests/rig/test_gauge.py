@@ -1,0 +1,79 @@
+"""What the data leave open: sizes against weights, and where shapes rest."""
+
+import numpy as np
+import pytest
+
+from rig.gauge import choose_scales, count_peaks, resting_weights, shape_sizes
+
+STILLS = np.zeros(40, dtype=bool)
+
+
+def _amounts(seed: int, shapes: int = 200, activations: int = 6):
+    """True sizes about the template's, and what a fit finds in the template's scale."""
+    rng = np.random.default_rng(seed)
+    sizes = np.exp(rng.normal(0.0, 0.2, shapes))
+    weights = np.zeros((40, shapes))
+    for k in range(shapes):
+        weights[rng.choice(40, activations, replace=False), k] = rng.uniform(0, 1, activations)
+    return sizes, weights * sizes
+
+
+def test_a_run_of_contiguous_frames_is_one_activation() -> None:
+    weights = np.array([0.0, 0.3, 0.6, 0.2, 0.0, 0.4, 0.4])[:, None]
+    take = np.array([False, True, True, True, True, True, True])
+    assert count_peaks(weights, take).tolist() == [2]
+    assert count_peaks(weights, np.zeros(7, dtype=bool)).tolist() == [5]
+
+
+def test_sizes_come_nearer_the_truth_than_the_template_is() -> None:
+    sizes, amounts = _amounts(1)
+    scales = choose_scales(amounts, STILLS, np.ones(len(sizes)), 0.2)
+    before = np.sqrt((np.log(sizes) ** 2).mean())
+    after = np.sqrt((np.log(sizes / scales) ** 2).mean())
+    assert after < 0.8 * before
+    assert abs(np.log(sizes / scales).mean()) < 0.05
+
+
+def test_weights_fit_the_box_afterwards() -> None:
+    _, amounts = _amounts(2)
+    scales = choose_scales(1.5 * amounts, STILLS, np.ones(amounts.shape[1]), 0.2)
+    assert (1.5 * amounts / scales).max() <= 1.0
+
+
+def test_what_was_never_exercised_keeps_its_size() -> None:
+    scales = choose_scales(np.zeros((40, 3)), STILLS, np.array([0.5, 1.0, 2.0]), 0.2)
+    assert scales.tolist() == [1.0, 1.0, 1.0]
+
+
+def test_one_small_activation_hardly_moves_the_size() -> None:
+    weights = np.zeros((40, 1))
+    weights[5] = 0.3
+    assert choose_scales(weights, STILLS, np.ones(1), 0.2)[0] == pytest.approx(1.0, abs=0.06)
+
+
+def test_a_size_away_from_the_templates_is_drawn_back() -> None:
+    weights = np.zeros((40, 1))
+    weights[5] = 0.3
+    scale = choose_scales(weights, STILLS, np.array([1.5]), 0.2)[0]
+    assert 0.6 < scale < 0.75
+
+
+def test_a_shape_that_is_on_in_most_frames_rests_there() -> None:
+    rng = np.random.default_rng(3)
+    weights = np.zeros((60, 3))
+    weights[:, 0] = 0.2 + rng.normal(0, 0.005, 60)
+    weights[::7, 0] = rng.uniform(0.3, 1.0, len(weights[::7]))
+    weights[::3, 1] = rng.uniform(0.2, 1.0, 20)
+    weights[:, 2] = rng.uniform(0.0, 1.0, 60)  # someone who talks: no resting value
+    rest = resting_weights(weights)
+    assert rest[0] == pytest.approx(0.2, abs=0.01)
+    assert rest[1:].tolist() == [0.0, 0.0]
+
+
+def test_sizes_are_measured_along_the_original() -> None:
+    rng = np.random.default_rng(4)
+    shapes = rng.normal(size=(3, 50, 3))
+    assert shape_sizes(shapes * np.array([0.7, 1.0, 1.6])[:, None, None], shapes) == pytest.approx(
+        [0.7, 1.0, 1.6]
+    )
+    assert shape_sizes(-shapes, shapes).tolist() == [0.1, 0.1, 0.1]

@@ -169,7 +169,8 @@ def annotate_pairs(
     """Lid pairs (N, 2) and lip pairs (M, 2), upper vertex first, of a face with holes for them.
 
     The face is upright (+Y up, looking along +Z). Eyes are two holes at like heights with the mouth
-    below and between them. A face without such holes has no pairs: both arrays are empty.
+    below and between them, all three in one connected piece of the mesh. A face without such holes
+    has no pairs: both arrays are empty.
 
     Args:
         vertices: (V, 3) mm, of the neutral.
@@ -178,8 +179,11 @@ def annotate_pairs(
     """
     found = find_slits(vertices, triangles) if slits is None else slits
     holes = [slit for slit in found if slit.opening is not None]
+    _, piece = csgraph.connected_components(edge_lengths(vertices, triangles), directed=False)
     for mouth in sorted(holes, key=lambda slit: float(slit.centre[1])):
+        own = piece[_corner(mouth)]
         above = [slit for slit in holes if slit.centre[1] > mouth.centre[1]]
+        above = [slit for slit in above if piece[_corner(slit)] == own]
         for left, right in combinations(above, 2):
             x = left.centre[0] - mouth.centre[0], right.centre[0] - mouth.centre[0]
             apart = abs(x[0] - x[1])
@@ -189,6 +193,10 @@ def annotate_pairs(
                 return np.concatenate(lids), _upper_first(vertices, mouth)
     none = np.zeros((0, 2), dtype=np.int64)
     return none, none
+
+
+def _corner(slit: Slit) -> int:
+    return -1 if slit.opening is None else int(slit.opening.corners[0])
 
 
 def _upper_first(vertices: Floats, slit: Slit) -> Ints:
@@ -221,7 +229,7 @@ def _nearer(seeds: tuple[Ints, Ints], reach_mm: float, graph: sparse.csr_array) 
 
 
 def _contacts(vertices: Floats, triangles: Ints32, graph: sparse.csr_array, free: Bools) -> Ints:
-    """Pairs (N, 2) of free vertices that touch, far apart along the mesh.
+    """Pairs (N, 2) of free vertices of one connected piece that touch, far apart along it.
 
     `track.contact` counts edges for that, which on coarse meshes misses most of a mouth.
     """
@@ -229,14 +237,16 @@ def _contacts(vertices: Floats, triangles: Ints32, graph: sparse.csr_array, free
     ids = np.flatnonzero(free)
     near = ids[cKDTree(vertices[ids]).query_pairs(_CONTACT_MM, output_type="ndarray")]
     facing = np.einsum("nx,nx->n", normals[near[:, 0]], normals[near[:, 1]]) < _FACING
-    near = near[facing].astype(np.int64)
+    _, piece = csgraph.connected_components(graph, directed=False)
+    near = near[facing & (piece[near[:, 0]] == piece[near[:, 1]])].astype(np.int64)
     sources, place = np.unique(near[:, 0], return_inverse=True)
     apart = np.zeros(len(near), dtype=np.bool_)
     for start in range(0, len(sources), _CHUNK):
         away = csgraph.dijkstra(graph, indices=sources[start : start + _CHUNK], limit=_ALONG_MM)
         own = np.flatnonzero((place >= start) & (place < start + _CHUNK))
         apart[own] = ~np.isfinite(away[place[own] - start, near[own, 1]])
-    return near[apart]
+    contacts: Ints = near[apart]
+    return contacts
 
 
 def _touching(pairs: Ints, graph: sparse.csr_array) -> list[tuple[Ints, Ints]]:

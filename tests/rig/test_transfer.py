@@ -107,6 +107,30 @@ def test_lips_that_touch_at_rest_part_as_far_as_the_templates() -> None:
     assert np.abs(deltas[0] - opening[0]).max() < 1e-6
 
 
+def test_lids_part_by_the_templates_millimetres_on_a_wider_eye() -> None:
+    narrow = _slit(1.0)
+    opening = np.zeros((1, 66, 3))
+    opening[0, 22:33, 1] = 8.0
+    opening[0, 11:22, 1] = 4.0
+    template = Template(
+        neutral=narrow.neutral, deltas=opening, names=("eyeWide",), polygons=narrow.polygons,
+        lid_pairs=narrow.lid_pairs,
+    )  # fmt: skip
+    deltas = transfer_shapes(template, _slit(6.0).neutral)  # nine times its own gap would be 48
+    assert np.abs(deltas[0] - opening[0]).max() < 1.0
+
+
+def test_a_collapsed_triangle_of_the_template_does_not_throw_vertices() -> None:
+    template = grid_template()
+    squeezed = template.neutral.copy()
+    squeezed[105] = squeezed[106] + 1e-4 * (squeezed[105] - squeezed[106])
+    other = Template(
+        neutral=squeezed, deltas=template.deltas, names=template.names, polygons=template.polygons
+    )
+    deltas = transfer_shapes(other, template.neutral)
+    assert np.abs(deltas - template.deltas).max() < 0.5
+
+
 def test_pairs_that_are_not_neighbours_are_not_joined() -> None:
     template = _slit(8.0)
     broken = Template(

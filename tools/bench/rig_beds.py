@@ -62,11 +62,13 @@ class Filming:
         performance: as the tracker would write it; frame 0 is an imperfect neutral.
         weights: (F, B).
         rotations: (F, 3, 3) of the head.
+        noise_mm: root mean square tracking error of a vertex: no honest fit is much below it.
     """
 
     performance: Performance
     weights: Floats
     rotations: Floats
+    noise_mm: float
 
 
 def hidden_rig(bed: str, seed: int, shapes: int, shared: Path | None = None) -> HiddenRig:
@@ -190,7 +192,8 @@ def film(
         head_from_neutral=np.tile(np.eye(4), (poses, 1, 1)),
         reference=np.full(poses, -1, dtype=np.int64),
     )
-    return Filming(performance, weights, rotations)
+    noise_mm = float(np.sqrt(3.0 * white_mm**2 + smooth_mm**2))
+    return Filming(performance, weights, rotations, noise_mm)
 
 
 def seeds_of(text: str) -> Iterator[int]:

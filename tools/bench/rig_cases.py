@@ -51,6 +51,7 @@ def em_lines(
         yield {
             "goal": "3 em", "bed": bed, "seed": seed, "seconds": round(seconds, 1),
             "fit_start_mm": round(fit[0], 3), "fit_end_mm": round(fit[1], 3),
+            "noise_mm": round(filmed.noise_mm, 3),
             "fit": round(fit[1] / fit[0], 3), **scores,
             "neutral/input": round(scores["neutral_mm"] / neutral, 3),
             "rotation_deg": round(_rotation_error(filmed, hidden, rig), 4),

@@ -10,7 +10,10 @@ import numpy as np
 
 from capture.arrays import Bools, Floats, Ints, check_shape
 
+EXERCISED = 0.2
+"""A shape whose weights never pass this may be imitating errors: nothing is learnt of it."""
 _ACTIVE = 0.05  # weights above this are activations
+_NOTABLE = 0.1  # weights above this tell how often shapes are activated
 _MOST_PEAKS = 12  # more activations than this say no more about how far an actor goes
 _SOFT = 0.04  # relative error of the largest activation
 _WINDOW = 0.06  # width of weights that count as one resting value
@@ -34,6 +37,12 @@ def count_peaks(weights: Floats, contiguous: Bools) -> Ints:
     return peaks
 
 
+def repetition(weights: Floats, contiguous: Bools) -> float:
+    """How often, on average, a shape that is activated at all is activated: 0 when none is."""
+    peaks = count_peaks(np.where(weights > _NOTABLE, weights, 0.0), contiguous)
+    return float(peaks[peaks > 0].mean()) if (peaks > 0).any() else 0.0
+
+
 def choose_scales(weights: Floats, contiguous: Bools, sizes: Floats, variation: float) -> Floats:
     """Factor s (B,) by which each shape is to grow, its weights being divided by it.
 
@@ -41,7 +50,7 @@ def choose_scales(weights: Floats, contiguous: Bools, sizes: Floats, variation: 
     log-normal about 1 with deviation `variation`; and an actor who is asked for expressions goes
     anywhere between rest and the full shape, so that n activations, the largest of which is m,
     are n draws from a uniform distribution: likelihood `s^-n` for s >= m. The template alone
-    decides for a shape that is never activated, and nearly alone for one that is activated once.
+    decides for a shape that was hardly exercised, and nearly alone for one activated once.
 
     Args:
         weights: (F, B) in the present scale; may exceed 1.
@@ -55,7 +64,8 @@ def choose_scales(weights: Floats, contiguous: Bools, sizes: Floats, variation: 
     spread = np.log1p(variation)
     scales = np.ones(weights.shape[1])
     for k, (n, m) in enumerate(zip(peaks, largest, strict=True)):
-        if n == 0:
+        if n == 0 or m < EXERCISED:
+            scales[k] = 1.0 / sizes[k]
             continue
         belief = -0.5 * (np.log(_SCALES * sizes[k]) / spread) ** 2 - n * np.log(_SCALES)
         over = np.maximum(m / _SCALES - 1.0, 0.0) / _SOFT

@@ -66,15 +66,29 @@ def deformation_gradients(rest: Floats, deformed: Floats, triangles: Ints32) -> 
         Sumner and Popovic 2004, Deformation transfer for triangle meshes, section 3.
     """
     check_shape(rest=(rest, "V 3"), deformed=(deformed, "V 3"), triangles=(triangles, "T 3"))
-    source, source_flat = _frames(rest, triangles)
-    target, target_flat = _frames(deformed, triangles)
-    target[target_flat, :, 2] = source[target_flat, :, 2]
-    source[source_flat] = np.eye(3)
-    target[source_flat] = np.eye(3)
-    gradients: Floats = target @ np.linalg.inv(source)
-    still = (rest[triangles] == deformed[triangles]).all(axis=(1, 2))
-    gradients[still] = np.eye(3)
-    return gradients
+    return RestFrames(rest, triangles).gradients(deformed, np.arange(len(triangles)))
+
+
+class RestFrames:
+    """The frame of every triangle at rest, inverted once for any number of deformations."""
+
+    def __init__(self, rest: Floats, triangles: Ints32) -> None:
+        self._rest, self._triangles = rest, triangles
+        self._source, self._flat = _frames(rest, triangles)
+        square = self._source.copy()
+        square[self._flat] = np.eye(3)
+        self._inverse = np.linalg.inv(square)
+
+    def gradients(self, deformed: Floats, chosen: Ints) -> Floats:
+        """As `deformation_gradients`, of the triangles `chosen` (n,): (n, 3, 3)."""
+        triangles = self._triangles[chosen]
+        target, flat = _frames(deformed, triangles)
+        target[flat, :, 2] = self._source[chosen[flat], :, 2]
+        target[self._flat[chosen]] = np.eye(3)
+        gradients: Floats = target @ self._inverse[chosen]
+        still = (self._rest[triangles] == deformed[triangles]).all(axis=(1, 2))
+        gradients[still] = np.eye(3)
+        return gradients
 
 
 def components(triangles: Ints32, vertex_count: int) -> Ints:

@@ -64,7 +64,7 @@ class RigSettings:
     l1_mm2: float = 0.02
     smoothness: float = 0.002
     temporal: Literal["causal", "joint"] = "causal"
-    evidence: float = 0.2
+    evidence: float = 0.12
     strict_evidence: float = 0.6
     debias: bool = True
     symmetry: float = 0.0
@@ -72,8 +72,8 @@ class RigSettings:
     head: Literal["all", "rigid"] = "all"
     rescale: bool = True
     size_variation: float = 0.25
-    variation: float = 0.15
-    gradient_mm2: float = 1.0
+    variation: float = 0.12
+    gradient_mm2: float = 10.0
     offset: float = 0.05
     neutral_offset: float = 0.05
     hold_out: bool = False

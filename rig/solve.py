@@ -11,7 +11,13 @@ from capture.arrays import Floats
 from capture.progress import Progress, silent
 from rig.evidence import Evidence
 from rig.fit import Fit, Iteration, Observations, undo_motion, weighted_rms
-from rig.gauge import choose_scales, resting_weights, shape_sizes
+from rig.gauge import (
+    EXERCISED,
+    choose_scales,
+    repetition,
+    resting_weights,
+    shape_sizes,
+)
 from rig.gradient import gradient_operator
 from rig.locality import Locality, Mask, mask_shapes
 from rig.neutral_frame import rigid_weights
@@ -40,6 +46,7 @@ __all__ = [
 _NOISE_FLOOR_MM = 0.05  # what tracking is never better than
 _RETRANSFER_MM = 0.05  # root mean square move of the neutral that makes the transfer stale
 _RELAXING = 0.8  # of the strict evidence is asked in the next turn
+_FEW_REPEATS, _MANY_REPEATS = 1.5, 3.5  # activations a shape: not strict, fully strict
 _LOOSE_UPPER = 1.5  # bound of weights between turns: the gauge, not the box, sets a shape's size
 
 
@@ -51,8 +58,8 @@ class Schedule:
         transfer: how the template's shapes are carried to the actor's neutral.
         iterations: most turns.
         relative_change: of the total energy, below which it stops.
-        strict_evidence: what a shape must explain to be active in the first turn; it falls to
-            `weights.evidence` by a fifth a turn.
+        strict_evidence: what a shape must explain to be active in the first turn, if shapes are
+            seen in many combinations; it falls to `weights.evidence` by a fifth a turn.
         rescale: whether each shape's size against its weights is chosen anew at every turn.
         mask: kind of locality.
         mask_tolerance: of a shape's extent, below which the template holds a vertex still.
@@ -73,19 +80,29 @@ class Schedule:
     mask: Literal["vertex", "soft", "literal"] = "vertex"
     mask_tolerance: float = 1e-3
     size_variation: float = 0.25
-    variation: float = 0.15
+    variation: float = 0.12
     weights: WeightPriors = field(default_factory=WeightPriors)
     update: UpdatePriors = field(default_factory=UpdatePriors)
 
-    def posing(self, turn: int) -> WeightPriors:
-        """Priors of the weights step after `turn` updates of the shapes."""
-        strict = self.strict_evidence * _RELAXING**turn
+    def posing(self, turn: int, repeated: float) -> WeightPriors:
+        """Priors of the weights step after `turn` updates of the shapes.
+
+        What shape k lacks looks like another shape that is always active with k. Strictness has k
+        learn it, and that is right where k was seen in several combinations. Where shapes were
+        seen once, in one expression, it would melt those of an expression into one.
+
+        Args:
+            turn: updates so far.
+            repeated: how often a shape is activated, on average.
+        """
+        share = min(max((repeated - _FEW_REPEATS) / (_MANY_REPEATS - _FEW_REPEATS), 0.0), 1.0)
+        strict = share * self.strict_evidence * _RELAXING**turn
         evidence = max(self.weights.evidence, strict) if self.weights.evidence > 0.0 else 0.0
         return replace(self.weights, evidence=evidence)
 
-    def relaxed(self, turn: int) -> bool:
+    def relaxed(self, turn: int, repeated: float) -> bool:
         """Whether the priors stay as they are from this turn on."""
-        return self.posing(turn).evidence <= self.weights.evidence
+        return self.posing(turn, repeated).evidence <= self.weights.evidence
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -201,7 +218,7 @@ def personalise(problem: Problem, neutral: Floats, progress: Progress = silent) 
         progress(turn + 1, schedule.iterations, "rig")
         if turn + 1 == schedule.iterations or work.settled():
             break
-        work.pose(schedule.posing(turn + 1))
+        work.pose(turn + 1)
     progress(schedule.iterations, schedule.iterations, "rig")
     return work.finish()
 
@@ -222,23 +239,24 @@ class _Alternation:
         self._targets = self._original
         self._first = pose_problem(problem, (neutral, self._original), schedule.weights)
         self._fit = self._first
+        self._repeated = repetition(self._first.weights, problem.seen.contiguous)
         self._turns: list[Iteration] = []
         self._relative_mm2 = 0.0
         if problem.seen.weights is None:
-            self.pose(schedule.posing(0))
+            self.pose(0)
 
     def update(self) -> None:
         """Fix what the data leave open, then solve the neutral and all shapes."""
-        problem, fit = self._problem, self._fit
+        fit = self._fit
         if len(self._turns) > 0 and _rms(fit.neutral - self._carried) > _RETRANSFER_MM:
             sizes = shape_sizes(self._targets, self._original)
             self._carried = fit.neutral
             self._original = self._transferred(fit.neutral)
             self._targets = self._original * sizes[:, None, None]
-        if problem.seen.weights is None and self._schedule.rescale:
+        if self._schedule.rescale:
             fit = self._fix_gauge(fit)
         priors = self._priors(fit)
-        evidence = Evidence(undo_motion(fit, problem.seen), problem.seen.confidence, fit.weights)
+        evidence = self._evidence(fit)
         if self._artist is not None:
             evidence = evidence.with_rows(self._artist)
         neutral, deltas = update_shapes(
@@ -254,19 +272,28 @@ class _Alternation:
         self._relative_mm2 = priors.relative_mm2
         self._turns.append(self._measure(fit.neutral, priors))
 
-    def pose(self, priors: WeightPriors) -> None:
+    def _evidence(self, fit: Fit) -> Evidence:
+        """The frames; what shapes that were hardly exercised show is taken off, as not theirs."""
+        seen = self._problem.seen
+        offsets = undo_motion(fit, seen)
+        if seen.weights is not None:
+            return Evidence(offsets, seen.confidence, fit.weights)
+        resting = (fit.weights.max(axis=0, initial=0.0) < EXERCISED) & ~self._held
+        offsets -= np.tensordot(fit.weights[:, resting], self._targets[resting], axes=1)
+        return Evidence(offsets, seen.confidence, np.where(resting, 0.0, fit.weights))
+
+    def pose(self, turn: int) -> None:
         """Solve weights and head motion, with room above 1 that the gauge takes back."""
-        rescale = self._schedule.rescale and self._problem.seen.weights is None
-        priors = replace(priors, upper=_LOOSE_UPPER) if rescale else priors
-        start = self._fit.weights
-        self._fit = pose_problem(
-            self._problem, (self._fit.neutral, self._fit.deltas), priors, start
-        )
+        priors = self._schedule.posing(turn, self._repeated)
+        if self._schedule.rescale and self._problem.seen.weights is None:
+            priors = replace(priors, upper=_LOOSE_UPPER)
+        shapes = self._fit.neutral, self._fit.deltas
+        self._fit = pose_problem(self._problem, shapes, priors, self._fit.weights)
 
     def settled(self) -> bool:
         """Whether the last turn changed the energy by less than asked, the priors being final."""
         turns = self._turns
-        if len(turns) < 2 or not self._schedule.relaxed(len(turns) - 2):
+        if len(turns) < 2 or not self._schedule.relaxed(len(turns) - 2, self._repeated):
             return False
         change = abs(turns[-2].total - turns[-1].total)
         return change <= self._schedule.relative_change * turns[-1].total
@@ -288,7 +315,12 @@ class _Alternation:
         return np.where(self._mask.support, shapes, 0.0) if literal else shapes
 
     def _fix_gauge(self, fit: Fit) -> Fit:
+        """Choose sizes and rests; where weights are known, targets take the sizes found so far."""
         seen = self._problem.seen
+        if seen.weights is not None:
+            sizes = shape_sizes(fit.deltas, self._original)
+            self._targets = self._original * sizes[:, None, None]
+            return fit
         rest = resting_weights(fit.weights)
         neutral = fit.neutral + np.tensordot(rest, fit.deltas, axes=1)
         weights = np.maximum(fit.weights - rest, 0.0)

@@ -45,6 +45,7 @@ def solve_rig(
     *,
     weights: WeightTable | None = None,
     overrides: Sequence[Override] = (),
+    held_out: Sequence[Performance] = (),
     progress: Progress = silent,
 ) -> FaceRig:
     """Personalise a template to the performances of one actor.
@@ -59,6 +60,7 @@ def solve_rig(
         out: folder to write in.
         weights: where they are known beforehand, one row a frame of all performances in order.
         overrides: shapes as the artist wants them; left out, the rig without them comes back.
+        held_out: performances that are not solved on; the report says how well they are reached.
         progress: told after each turn.
 
     Returns:
@@ -82,6 +84,7 @@ def solve_rig(
         )
     product = Path(out) / "rig.npz"
     inputs = _hashes(template, performances, known) | _override_hashes(overrides)
+    inputs |= {f"held_out_{n}": _performance_hash(p) for n, p in enumerate(held_out)}
     record = stage_record("rig", settings, inputs)
     products = [product, Path(out) / "transferred.npz", Path(out) / "report.json"]
     if is_current(product, record) and all(path.exists() for path in products):
@@ -104,7 +107,10 @@ def solve_rig(
     report["best_fit"] = _best_fit(seen, solution.first, solution.fit)
     report["topology_matches"] = _same_topology(template, performances)
     carried = _whole_deltas(template, moving, solution.targets)
-    report["health"] = rig_health(rig, template, seen=seen, transferred=carried)
+    report["health"] = rig_health(
+        rig, template, seen=seen, held_out=observe(held_out) if held_out else None,
+        priors=settings.schedule().weights, transferred=carried,
+    )  # fmt: skip
     report["seconds"] = round(time.monotonic() - started, 3)
     write_report(products[2], report)
     write_template(products[1], replace(template, neutral=rig.neutral, deltas=carried))
@@ -276,10 +282,16 @@ def _hashes(
         )
     }  # fmt: skip
     for number, p in enumerate(performances):
-        inputs[f"performance_{number}"] = _digest(p.vertices, p.confidence, p.frames, p.polygons)
+        inputs[f"performance_{number}"] = _performance_hash(p)
     if known is not None:
         inputs["weights"] = _digest(known)
     return inputs
+
+
+def _performance_hash(performance: Performance) -> str:
+    return _digest(
+        performance.vertices, performance.confidence, performance.frames, performance.polygons
+    )
 
 
 def _override_hashes(overrides: Sequence[Override]) -> dict[str, str]:

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from capture.arrays import Bools, Floats, Ints, Ints32, check_finite, check_shape
-from rig.gradient import components, deformation_gradients, gradient_operator
+from rig.gradient import RestFrames, components, gradient_operator
 from rig.slits import polygon_edges
 from rig.template import Template
 
 MASK_TOLERANCE = 1e-3  # of a shape's own extent: below it a vertex counts as static
 _LEAK_MM = 0.03  # motion of static vertices above which a shape is solved with them held
+_THREADS = 2
 _SHUT_MM = 0.3  # lids or lips of the template nearer than this at rest are shut
 _DISTORTED = 5.0  # a triangle stretched more than this between the two faces tells no gradient
 _BRIDGE_STRENGTH = 10.0  # of virtual triangles against skin: closing matters more than stretch
@@ -61,9 +64,10 @@ def transfer_shapes(
     transposed = operator.T.tocsr()
     skin = len(triangles) - len(bridges)
     plain = _distorted(template.neutral, neutral, triangles)
+    frames = RestFrames(template.neutral, triangles)
     for index, source in enumerate(template.deltas):
         delta = np.where(support[index][:, None], source, 0.0)
-        wanted = rest @ _wanted(template.neutral, delta, triangles)
+        wanted = rest @ _wanted(frames, template.neutral, delta, triangles)
         plain[skin:] = _parting(template.neutral, delta, bridges)
         if plain.any():
             wanted[plain] = (operator @ delta).reshape(-1, 3, 3)[plain]
@@ -71,12 +75,16 @@ def transfer_shapes(
     laplacian = sparse.csr_array(transposed @ operator)
     solved = _solve_anchored(laplacian, right, labels)
     deltas = np.ascontiguousarray(solved.reshape(len(neutral), -1, 3).transpose(1, 0, 2))
-    for index, source in enumerate(template.deltas):
-        settled, leak_mm = _settle(deltas[index], source, support[index], labels)
+
+    def settle(index: int) -> None:
+        settled, leak_mm = _settle(deltas[index], template.deltas[index], support[index], labels)
         if leak_mm > _LEAK_MM:
             wanted = right[:, 3 * index : 3 * index + 3]
             _solve_held(laplacian, wanted, support[index], labels, settled)
         deltas[index] = settled
+
+    with ThreadPoolExecutor(_THREADS) as pool:  # the factorisations leave the interpreter's lock
+        list(pool.map(settle, range(len(deltas))))
     return deltas
 
 
@@ -98,11 +106,11 @@ def virtual_triangles(template: Template) -> Ints32:
     return np.array(found, dtype=np.int32).reshape(-1, 3)
 
 
-def _wanted(rest: Floats, delta: Floats, triangles: Ints32) -> Floats:
+def _wanted(frames: RestFrames, rest: Floats, delta: Floats, triangles: Ints32) -> Floats:
     """(F - I)^T of every triangle, exactly zero where the template does not move."""
     change = np.zeros((len(triangles), 3, 3))
     moved = np.flatnonzero((delta[triangles] != 0.0).any(axis=(1, 2)))
-    gradients = deformation_gradients(rest, rest + delta, triangles[moved])
+    gradients = frames.gradients(rest + delta, moved)
     change[moved] = (gradients - np.eye(3)).transpose(0, 2, 1)
     return change
 

@@ -40,9 +40,11 @@ def test_weights_fit_the_box_afterwards() -> None:
     assert (1.5 * amounts / scales).max() <= 1.0
 
 
-def test_what_was_never_exercised_keeps_its_size() -> None:
-    scales = choose_scales(np.zeros((40, 3)), STILLS, np.array([0.5, 1.0, 2.0]), 0.2)
-    assert scales.tolist() == [1.0, 1.0, 1.0]
+def test_what_was_hardly_exercised_takes_the_templates_size() -> None:
+    weights = np.zeros((40, 3))
+    weights[3:9, 2] = 0.15
+    scales = choose_scales(weights, STILLS, np.array([0.5, 1.0, 2.0]), 0.2)
+    assert scales.tolist() == [2.0, 1.0, 0.5]
 
 
 def test_one_small_activation_hardly_moves_the_size() -> None:

@@ -15,6 +15,7 @@ import tyro
 
 from capture.errors import WorkError
 from capture.progress import Progress
+from rig.overrides import read_overrides
 from rig.stage import RigSettings, check_match, solve_rig
 from rig.template import read_template
 from rig.weight_table import read_weights
@@ -38,6 +39,10 @@ class Arguments(Options):
     """The folder to write."""
     weights: Path | None = None
     """Known weights of all frames, weights.npz; solved for when left out."""
+    overrides: Path | None = None
+    """Shapes as the artist wants them, overrides.toml; leave it out and they are gone again."""
+    held_out: tuple[Path, ...] = ()
+    """Performances that are not solved on but judged by, performance.npz."""
     page: bool = True
     """Write DIR/report.html, a page that needs nothing else."""
     settings: Annotated[RigSettings, tyro.conf.arg(name="")] = field(default_factory=RigSettings)
@@ -48,12 +53,17 @@ def run(arguments: Arguments, progress: Progress) -> dict[str, Any]:
     template = read_template(arguments.template)
     performances = [read_performance(path) for path in arguments.performance]
     check_match(template, performances, names=[str(path) for path in arguments.performance])
+    held_out = [read_performance(path) for path in arguments.held_out]
+    if held_out:
+        check_match(template, held_out, names=[str(path) for path in arguments.held_out])
     solve_rig(
         template,
         performances,
         arguments.settings,
         arguments.out,
         weights=None if arguments.weights is None else read_weights(arguments.weights),
+        overrides=[] if arguments.overrides is None else read_overrides(arguments.overrides),
+        held_out=held_out,
         progress=progress,
     )
     report = json.loads((arguments.out / "report.json").read_text(encoding="utf-8"))

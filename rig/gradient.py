@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import sparse
 
-from capture.arrays import Floats, Ints, Ints32, check_shape
+from capture.arrays import Bools, Floats, Ints, Ints32, check_shape
 
 
 def gradient_operator(vertices: Floats, triangles: Ints32) -> sparse.csr_array:
@@ -66,28 +66,27 @@ def deformation_gradients(rest: Floats, deformed: Floats, triangles: Ints32) -> 
         Sumner and Popovic 2004, Deformation transfer for triangle meshes, section 3.
     """
     check_shape(rest=(rest, "V 3"), deformed=(deformed, "V 3"), triangles=(triangles, "T 3"))
-    return RestFrames(rest, triangles).gradients(deformed, np.arange(len(triangles)))
+    frames = RestFrames(rest, triangles)
+    return frames.gradients((deformed - rest)[triangles], np.arange(len(triangles)))
 
 
 class RestFrames:
     """The frame of every triangle at rest, inverted once for any number of deformations."""
 
     def __init__(self, rest: Floats, triangles: Ints32) -> None:
-        self._rest, self._triangles = rest, triangles
-        self._source, self._flat = _frames(rest, triangles)
+        self._corners = np.asarray(rest, dtype=np.float64)[triangles]
+        self._source, self._flat = _frames(self._corners)
         square = self._source.copy()
         square[self._flat] = np.eye(3)
         self._inverse = np.linalg.inv(square)
 
-    def gradients(self, deformed: Floats, chosen: Ints) -> Floats:
-        """As `deformation_gradients`, of the triangles `chosen` (n,): (n, 3, 3)."""
-        triangles = self._triangles[chosen]
-        target, flat = _frames(deformed, triangles)
+    def gradients(self, moved: Floats, chosen: Ints) -> Floats:
+        """As `deformation_gradients`, where corners move by (n, 3, 3), of triangles (n,): n 3x3."""
+        target, flat = _frames(self._corners[chosen] + moved)
         target[flat, :, 2] = self._source[chosen[flat], :, 2]
         target[self._flat[chosen]] = np.eye(3)
         gradients: Floats = target @ self._inverse[chosen]
-        still = (self._rest[triangles] == deformed[triangles]).all(axis=(1, 2))
-        gradients[still] = np.eye(3)
+        gradients[(moved == 0.0).all(axis=(1, 2))] = np.eye(3)
         return gradients
 
 
@@ -100,8 +99,7 @@ def components(triangles: Ints32, vertex_count: int) -> Ints:
     return np.asarray(labels, dtype=np.int64)
 
 
-def _frames(vertices: Floats, triangles: Ints32) -> tuple[Floats, np.ndarray]:
-    corner = vertices[triangles]
+def _frames(corner: Floats) -> tuple[Floats, Bools]:
     first, second = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
     normal = np.cross(first, second)
     length = np.linalg.norm(normal, axis=1)

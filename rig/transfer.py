@@ -16,6 +16,7 @@ from rig.template import Template
 MASK_TOLERANCE = 1e-3  # of a shape's own extent: below it a vertex counts as static
 _LEAK_MM = 0.03  # motion of static vertices above which a shape is solved with them held
 _THREADS = 2
+_TOGETHER = 200_000  # triangles of several shapes whose gradients are held at once
 _SHUT_MM = 0.3  # lids or lips of the template nearer than this at rest are shut
 _DISTORTED = 5.0  # a triangle stretched more than this between the two faces tells no gradient
 _BRIDGE_STRENGTH = 10.0  # of virtual triangles against skin: closing matters more than stretch
@@ -65,13 +66,19 @@ def transfer_shapes(
     skin = len(triangles) - len(bridges)
     plain = _distorted(template.neutral, neutral, triangles)
     frames = RestFrames(template.neutral, triangles)
-    for index, source in enumerate(template.deltas):
-        delta = np.where(support[index][:, None], source, 0.0)
-        wanted = rest @ _wanted(frames, template.neutral, delta, triangles)
-        plain[skin:] = _parting(template.neutral, delta, bridges)
-        if plain.any():
-            wanted[plain] = (operator @ delta).reshape(-1, 3, 3)[plain]
-        right[:, 3 * index : 3 * index + 3] = transposed @ wanted.reshape(-1, 3)
+    sources = np.where(support[:, :, None], template.deltas, 0.0)
+    together = max(1, _TOGETHER // max(len(triangles), 1))
+    for begin in range(0, len(sources), together):
+        part = sources[begin : begin + together]
+        wanted = rest @ _wanted(frames, part, triangles)
+        for index, delta in enumerate(part):
+            plain[skin:] = _parting(template.neutral, delta, bridges)
+            if plain.any():
+                wanted[index, plain] = (operator @ delta).reshape(-1, 3, 3)[plain]
+        stacked = wanted.reshape(len(part), -1, 3).transpose(1, 0, 2)
+        right[:, 3 * begin : 3 * (begin + len(part))] = transposed @ stacked.reshape(
+            3 * len(triangles), -1
+        )
     laplacian = sparse.csr_array(transposed @ operator)
     solved = _solve_anchored(laplacian, right, labels)
     deltas = np.ascontiguousarray(solved.reshape(len(neutral), -1, 3).transpose(1, 0, 2))
@@ -106,12 +113,13 @@ def virtual_triangles(template: Template) -> Ints32:
     return np.array(found, dtype=np.int32).reshape(-1, 3)
 
 
-def _wanted(frames: RestFrames, rest: Floats, delta: Floats, triangles: Ints32) -> Floats:
-    """(F - I)^T of every triangle, exactly zero where the template does not move."""
-    change = np.zeros((len(triangles), 3, 3))
-    moved = np.flatnonzero((delta[triangles] != 0.0).any(axis=(1, 2)))
-    gradients = frames.gradients(rest + delta, moved)
-    change[moved] = (gradients - np.eye(3)).transpose(0, 2, 1)
+def _wanted(frames: RestFrames, deltas: Floats, triangles: Ints32) -> Floats:
+    """(F - I)^T of every shape and triangle, exactly zero where the template does not move."""
+    moves = deltas[:, triangles]  # shape, triangle, corner, axis
+    shape, triangle = np.nonzero((moves != 0.0).any(axis=(2, 3)))
+    change = np.zeros((len(deltas), len(triangles), 3, 3))
+    gradients = frames.gradients(moves[shape, triangle], triangle)
+    change[shape, triangle] = (gradients - np.eye(3)).transpose(0, 2, 1)
     return change
 
 

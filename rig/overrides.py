@@ -62,7 +62,7 @@ class _Entry:
         check_ranges("override", self, strength=(1e-6, 1e6))
 
 
-def read_overrides(path: Path) -> list[Override]:
+def read_overrides(path: Path, out: Path | None = None) -> list[Override]:
     """Read overrides.toml: which rig was sculpted on, and a mesh for each shape.
 
     ```toml
@@ -76,6 +76,10 @@ def read_overrides(path: Path) -> list[Override]:
 
     Paths are relative to the file and may not leave its folder.
 
+    Args:
+        path: of the file.
+        out: folder that a rig is about to be written to, which must not be the base's.
+
     Raises:
         InputError: naming the file, the entry and what does not fit.
     """
@@ -85,7 +89,13 @@ def read_overrides(path: Path) -> list[Override]:
     entries = document.get("override", [])
     if not isinstance(entries, list) or not entries:
         raise InputError(f"{path}: expected one or more [[override]] tables, found none")
-    base = read_rig(_inside(path, document.get("base"), "base"))
+    where = _inside(path, document.get("base"), "base")
+    if out is not None and where == (Path(out) / "rig.npz").resolve():
+        raise InputError(
+            f"{path}: base: {document['base']} is the rig that would be written over; the sculpts "
+            f"are told against it, so keep it and write to another folder"
+        )
+    base = read_rig(where)
     found = [_override(path, base, table, index) for index, table in enumerate(entries, 1)]
     names = [override.name for override in found]
     twice = sorted({name for name in names if names.count(name) > 1})

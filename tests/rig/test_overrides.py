@@ -90,6 +90,13 @@ def test_refuses_a_file_without_entries(tmp_path: Path) -> None:
         read_overrides(_write(tmp_path, 'bse = "rig.npz"\n'))
 
 
+def test_refuses_to_write_over_the_base(tmp_path: Path) -> None:
+    _folder(tmp_path)
+    assert len(read_overrides(_told(tmp_path), tmp_path / "other")) == 1
+    with pytest.raises(InputError, match="write to another folder"):
+        read_overrides(_told(tmp_path), tmp_path)
+
+
 def test_each_row_shows_one_shape_alone() -> None:
     touched = np.zeros(400, dtype=bool)
     touched[:30] = True

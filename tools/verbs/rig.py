@@ -62,7 +62,9 @@ def run(arguments: Arguments, progress: Progress) -> dict[str, Any]:
         arguments.settings,
         arguments.out,
         weights=None if arguments.weights is None else read_weights(arguments.weights),
-        overrides=[] if arguments.overrides is None else read_overrides(arguments.overrides),
+        overrides=[]
+        if arguments.overrides is None
+        else read_overrides(arguments.overrides, arguments.out),
         held_out=held_out,
         progress=progress,
     )

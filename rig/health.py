@@ -38,6 +38,7 @@ VERSION = 1
 """Of the report: it grows when a key changes its meaning or goes."""
 UNDETERMINED = 0.5  # share of the prior's variance left above which a shape counts as unknown
 _ALLOWED_GROWTH = 0.1  # of the total variance, by leaving out redundant captures
+_AT_REST = 0.1  # a frame whose weights all lie below shows the neutral
 _NOISE_MM = 0.3  # of a vertex, where no frames say
 _LEAST_NOISE_MM = 0.05  # what tracking is never better than
 
@@ -186,6 +187,7 @@ def captures_report(rig: FaceRig, noise_mm: float, targets: Floats | None = None
         "redundant": [
             {"frame": drop.frame, "growth": drop.growth}
             for drop in redundant_captures(captures, _ALLOWED_GROWTH)
+            if rig.weights[drop.frame].max(initial=0.0) > _AT_REST  # the neutral is never to spare
         ],
         "uncertainty": {name: float(u) for name, u in zip(names, left, strict=True)},
         "expected_error_mm": {name: float(e) for name, e in zip(names, error_mm, strict=True)},

@@ -18,13 +18,11 @@ from rig.correspondence import Correspondence, correspond
 from rig.correspondence_fit import FitSettings
 from rig.gradient import components
 from rig.slits import annotate_pairs, edge_lengths
-from rig.template import Template
+from rig.template import Template, check_head_size
 from rig.transfer import factorised, transfer_shapes
 from rig.transfer_rbf import transfer_shapes_rbf
 
 _FADE_MM = 30.0  # along the mesh from what is bound: further away nothing moves
-_SIZE_MM = (60.0, 1000.0)  # the longest side of a face to a bust
-_UNITS = ((10.0, "centimetres"), (1000.0, "metres"), (25.4, "inches"))
 _METHODS = ("gradient", "rbf")
 
 
@@ -169,20 +167,8 @@ def check_face(mesh: Mesh) -> None:
     """
     if len(mesh.polygons) == 0:
         raise InputError("mesh: expected a face, found no polygons")
-    size = float(np.ptp(mesh.vertices[np.unique(mesh.triangles)], axis=0).max())
-    low, high = _SIZE_MM
-    if low <= size <= high:
-        return
-    fitting = [(factor, unit) for factor, unit in _UNITS if low <= size * factor <= high]
-    hint = (
-        f"; it looks like {fitting[0][1]}: multiply its vertices by {fitting[0][0]:g}"
-        if fitting
-        else ""
-    )
-    raise InputError(
-        f"mesh: expected a face in millimetres ({low:g} to {high:g} along its longest side), "
-        f"found {size:.4g}{hint}"
-    )
+    used = mesh.vertices[np.unique(mesh.triangles)]
+    check_head_size(used, "mesh: expected a face", "its vertices")
 
 
 def _pairs(template: Template, mesh: Mesh, correspondence: Correspondence) -> tuple[Ints, Ints]:

@@ -94,6 +94,33 @@ class Template:
         return acting
 
 
+def check_head_size(points: Floats, expected: str, scaled: str) -> None:
+    """Refuse a face whose size is not that of a face in millimetres.
+
+    Args:
+        points: (N, 3).
+        expected: the beginning of the message, such as "neutral: expected a head".
+        scaled: what is to be multiplied when it is in another unit.
+
+    Raises:
+        ShapeError: saying what was found and which factor would bring it to mm.
+    """
+    size = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
+    low, high = _HEAD_MM
+    if low <= size <= high:
+        return
+    fitting = [(factor, unit) for factor, unit in _UNITS if low <= size * factor <= high]
+    hint = (
+        f"; it looks like {fitting[0][1]}: multiply {scaled} by {fitting[0][0]:g}"
+        if fitting
+        else ""
+    )
+    raise ShapeError(
+        f"{expected} in millimetres ({low:g} to {high:g} along its longest side), "
+        f"found {size:.4g}{hint}"
+    )
+
+
 def duplicate_names(names: Sequence[str]) -> list[str]:
     """One line that lists the names given more than once; empty when all differ."""
     twice = sorted({name for name in names if list(names).count(name) > 1})
@@ -116,7 +143,7 @@ def read_template(path: Path) -> Template:
             polygons=_padded(arrays["polygons"]),
             **{key: whole_numbers(arrays[key], key) for key in arrays if key not in _REQUIRED},
         )
-        _check_units(template.neutral)
+        check_head_size(template.neutral, "neutral: expected a head", "neutral and deltas")
     except InputError as error:
         raise ShapeError(f"{path}: {error}") from error
     return template
@@ -171,20 +198,3 @@ def _index_problems(template: Template) -> list[str]:
             f"found {corners.min()}..{corners.max()}"
         )
     return problems
-
-
-def _check_units(neutral: Floats) -> None:
-    size = float(np.ptp(neutral, axis=0).max()) if len(neutral) else 0.0
-    low, high = _HEAD_MM
-    if low <= size <= high:
-        return
-    fitting = [(factor, unit) for factor, unit in _UNITS if low <= size * factor <= high]
-    hint = (
-        f"; it looks like {fitting[0][1]}: multiply neutral and deltas by {fitting[0][0]:g}"
-        if fitting
-        else ""
-    )
-    raise ShapeError(
-        f"neutral: expected a head in millimetres ({low:g} to {high:g} along its longest side), "
-        f"found {size:.4g}{hint}"
-    )

@@ -15,6 +15,7 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -54,6 +55,11 @@ TRAINING = {
     "funnel": "mouthFunnel:0.8,jawOpen:0.5,jawLeft:0.5",
     "pucker": "mouthPucker:0.9,jawForward:0.5,cheekPuff_L:0.4",
 }
+ALONE = {  # what a range of motion asks for by itself, and the takes above show in company only
+    "smile": "mouthSmile_L:0.7,mouthSmile_R:0.8",
+    "inner_brows": "browInnerUp_L:0.8,browInnerUp_R:0.8,jawOpen:0.2",
+    "wrinkle": "noseSneer_L:0.7,noseSneer_R:0.8,mouthShrugLower:0.5",
+}
 HELD_OUT = {
     "held_grin": "mouthSmile_L:0.8,mouthSmile_R:0.9,jawOpen:0.3,browInnerUp_L:0.5,"
     "browInnerUp_R:0.5,noseSneer_L:0.4,noseSneer_R:0.4",
@@ -62,7 +68,7 @@ HELD_OUT = {
 }
 _ORDER = (
     "smile_open", "brows_up", "frown", "sneer", "held_grin", "stretch", "side", "funnel",
-    "pucker", "held_grimace",
+    "pucker", "held_grimace", *ALONE,
 )  # fmt: skip
 
 
@@ -75,7 +81,7 @@ def make_takes(folder: Path, shared: Path, names: Sequence[str] = _ORDER) -> Non
             continue
         place.mkdir(parents=True, exist_ok=True)
         if not (source / "neutral.obj").exists():  # the last that the renderer writes
-            expression = (TRAINING | HELD_OUT)[name]
+            expression = (TRAINING | ALONE | HELD_OUT)[name]
             words = ["--seed", str(ACTOR_SEED), "--size", str(_SIZE_PX), "--expr", expression]
             script = str(shared.resolve() / "tools" / "render_take.py")
             _run([script, str(source), "--frames", str(_FRAMES), *words])
@@ -88,6 +94,9 @@ def make_takes(folder: Path, shared: Path, names: Sequence[str] = _ORDER) -> Non
 def pixel_lines(folder: Path, shared: Path, seeds: Sequence[int]) -> Iterator[dict[str, Any]]:
     """One line a template and held-out take, over the takes that are tracked.
 
+    Each is solved on the takes that show shapes in company, and again with those that show some
+    alone.
+
     Args:
         folder: of `make_takes`.
         shared: the folder with data/ict.
@@ -99,13 +108,13 @@ def pixel_lines(folder: Path, shared: Path, seeds: Sequence[int]) -> Iterator[di
         for name in _ORDER
         if _product(folder, name).exists()
     }
-    training = [performances[name] for name in TRAINING if name in performances]
     model = ict_template(ict_path(shared), _TRACKED_VERTICES)
-    for seed in (None, *seeds):
+    for chosen, seed in product((TRAINING, TRAINING | ALONE), (None, *seeds)):
+        training = [performances[name] for name in chosen if name in performances]
         template = model if seed is None else artist_template(model, seed)
-        out = folder / f"rig_{'model' if seed is None else seed}"
+        kind = "model" if seed is None else str(seed)
         started = time.perf_counter()
-        rig = solve_rig(template, training, RigSettings(), out)
+        rig = solve_rig(template, training, RigSettings(), folder / f"rig_{kind}_{len(training)}")
         seconds = time.perf_counter() - started
         for name in HELD_OUT:
             if name not in performances:

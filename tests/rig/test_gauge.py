@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
-from rig.gauge import choose_scales, count_peaks, resting_weights, shape_sizes
+from rig.gauge import choose_scales, count_peaks, repetition, resting_weights, shape_sizes
+from rig.solve import Schedule
+from rig.weights import WeightPriors
 
 STILLS = np.zeros(40, dtype=bool)
 
@@ -79,3 +81,26 @@ def test_sizes_are_measured_along_the_original() -> None:
         [0.7, 1.0, 1.6]
     )
     assert shape_sizes(-shapes, shapes).tolist() == [0.1, 0.1, 0.1]
+
+
+def test_repetition_counts_activations_of_shapes_that_have_any() -> None:
+    weights = np.zeros((12, 3))
+    weights[[1, 4, 7], 0] = 0.5
+    weights[2, 1] = 0.9
+    weights[5, 1] = 0.08  # too little to tell
+    assert repetition(weights, np.zeros(12, dtype=bool)) == 2.0
+    assert repetition(np.zeros((12, 3)), np.zeros(12, dtype=bool)) == 0.0
+
+
+def test_activity_is_priced_high_at_first_only_where_shapes_are_seen_in_combinations() -> None:
+    schedule = Schedule(strict_evidence=0.6, weights=WeightPriors(evidence=0.1))
+    prices = [schedule.posing(turn, 6.0).evidence for turn in range(12)]
+    assert prices[0] == 0.6
+    assert prices == sorted(prices, reverse=True)
+    assert prices[-1] == 0.1
+    assert schedule.posing(0, 1.2).evidence == 0.1
+    assert 0.1 < schedule.posing(0, 2.5).evidence < 0.6
+    assert not schedule.relaxed(0, 6.0)
+    assert schedule.relaxed(11, 6.0)
+    off = Schedule(strict_evidence=0.6, weights=WeightPriors(evidence=0.0))
+    assert off.posing(0, 6.0).evidence == 0.0

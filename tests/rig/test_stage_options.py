@@ -160,3 +160,28 @@ def test_refuses_choices_that_do_not_fit(actor: Actor, tmp_path: Path) -> None:
 def test_a_report_tells_health(actor: Actor, tmp_path: Path) -> None:
     _, report = _solve(actor, tmp_path)
     assert {"gauge", "symmetry", "captures", "interference", "degenerate"} <= set(report["health"])
+
+
+def test_shapes_that_nobody_exercised_stay_at_the_transferred_template(tmp_path: Path) -> None:
+    actor = Actor(5)
+    actor.weights[:, 3] = 0.0
+    actor.points = np.einsum("fb,bva->fva", actor.weights, actor.deltas) + actor.neutral
+    actor.points += np.random.default_rng(5).normal(0, 0.1, actor.points.shape)
+    rig, _ = _solve(actor, tmp_path, RigSettings(iterations=4))
+    carried = read_template(tmp_path / "transferred.npz")
+    assert rig.weights[:, 3].max() < 0.2
+    assert np.abs(rig.deltas[3] - carried.deltas[3]).max() < 0.02
+    assert np.abs(rig.deltas[0] - carried.deltas[0]).max() > 0.2
+
+
+def test_sizes_come_from_how_far_shapes_were_exercised(tmp_path: Path) -> None:
+    """An actor with shapes of half and of one and a half times the artist's, fully exercised."""
+    actor = Actor(6, frames=40)
+    gains = np.array([0.6, 1.4, 0.7, 1.3, 1.0, 1.0])
+    actor.deltas = actor.template.deltas * gains[:, None, None]
+    actor.points = np.einsum("fb,bva->fva", actor.weights, actor.deltas) + actor.neutral
+    errors = []
+    for rescale in (True, False):
+        rig, _ = _solve(actor, tmp_path / str(rescale), RigSettings(rescale=rescale))
+        errors.append(_rms((rig.deltas - actor.deltas)[:4]))
+    assert errors[0] < 0.6 * errors[1]

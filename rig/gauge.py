@@ -18,6 +18,8 @@ _MOST_PEAKS = 12  # more activations than this say no more about how far an acto
 _SOFT = 0.04  # relative error of the largest activation
 _WINDOW = 0.06  # width of weights that count as one resting value
 _RESTING = 0.4  # share of the frames that must rest there
+_BELOW = 0.3  # share of the frames that may lie below
+_LARGEST_REST = 0.35  # what is on by more is meant
 _SMALLEST = 0.1  # of the template: a shape that shrank further has lost its meaning
 _SCALES = np.geomspace(0.25, 4.0, 1201)
 
@@ -78,6 +80,9 @@ def choose_scales(weights: Floats, contiguous: Bools, sizes: Floats, variation: 
 def resting_weights(weights: Floats) -> Floats:
     """The weight (B,) at which each shape rests: 0, unless many frames agree on another value.
 
+    That value has to be small, and few frames may lie below it: an expression that is held through
+    much of a take is no rest.
+
     Args:
         weights: (F, B).
 
@@ -91,8 +96,10 @@ def resting_weights(weights: Floats) -> Floats:
         ends = np.searchsorted(column, column + _WINDOW, side="right")
         counts = ends - np.arange(frames)
         best = int(np.argmax(counts))
-        if counts[best] >= _RESTING * frames and column[best] > 0.0:
-            rest[k] = float(np.median(column[best : ends[best]]))
+        value = float(np.median(column[best : ends[best]]))
+        often, low = counts[best] >= _RESTING * frames, best <= _BELOW * frames
+        if often and low and column[best] > 0.0 and value <= _LARGEST_REST:
+            rest[k] = value
     return rest
 
 

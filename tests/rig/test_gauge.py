@@ -74,6 +74,12 @@ def test_a_shape_that_is_on_in_most_frames_rests_there() -> None:
     assert rest[1:].tolist() == [0.0, 0.0]
 
 
+def test_an_expression_that_is_held_is_no_rest() -> None:
+    held = np.concatenate([np.zeros(10), np.linspace(0, 0.8, 10), np.full(30, 0.8)])
+    weakly = np.concatenate([np.zeros(20), np.full(20, 0.3), np.linspace(0.3, 0.0, 10)])
+    assert resting_weights(np.stack([held, weakly], axis=1)).tolist() == [0.0, 0.0]
+
+
 def test_sizes_are_measured_along_the_original() -> None:
     rng = np.random.default_rng(4)
     shapes = rng.normal(size=(3, 50, 3))

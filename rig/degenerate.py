@@ -125,7 +125,7 @@ def find_degenerate(
             not_shapes[names[k]] = reason
         else:
             moving.append(k)
-    flat = deltas[moving].reshape(len(moving), -1)
+    flat = deltas[moving].reshape(len(moving), 3 * deltas.shape[1])
     sizes = np.sqrt(np.einsum("bn,bn->b", flat, flat))
     cosines = (flat @ flat.T) / np.outer(sizes, sizes)
     called = [names[k] for k in moving]

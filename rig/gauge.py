@@ -18,6 +18,7 @@ _MOST_PEAKS = 12  # more activations than this say no more about how far an acto
 _SOFT = 0.04  # relative error of the largest activation
 _WINDOW = 0.06  # width of weights that count as one resting value
 _RESTING = 0.4  # share of the frames that must rest there
+_FEWEST = 5  # frames that must, however few there are
 _BELOW = 0.3  # share of the frames that may lie below
 _LARGEST_REST = 0.35  # what is on by more is meant
 _SMALLEST = 0.1  # of the template: a shape that shrank further has lost its meaning
@@ -37,6 +38,19 @@ def count_peaks(weights: Floats, contiguous: Bools) -> Ints:
     before[1:] = active[:-1] & contiguous[1:, None]
     peaks: Ints = (active & ~before).sum(axis=0)
     return peaks
+
+
+def without_gaps(seen: Bools, contiguous: Bools) -> tuple[Ints, Bools]:
+    """The frames (n,) that were seen (F,), and which of those go on where the last one was.
+
+    A gap inside a take does not end an activation: contiguity reaches across it.
+    """
+    check_shape(seen=(seen, "F"), contiguous=(contiguous, "F"))
+    breaks = np.cumsum(~contiguous)
+    kept = np.flatnonzero(seen)
+    linked = np.zeros(len(kept), dtype=bool)
+    linked[1:] = breaks[kept[1:]] == breaks[kept[:-1]]
+    return kept, linked
 
 
 def repetition(weights: Floats, contiguous: Bools) -> float:
@@ -92,12 +106,13 @@ def resting_weights(weights: Floats) -> Floats:
     check_shape(weights=(weights, "F B"))
     frames = len(weights)
     rest = np.zeros(weights.shape[1])
-    for k, column in enumerate(np.sort(weights, axis=0).T):
+    for k, column in enumerate(np.sort(weights, axis=0).T if frames else ()):
         ends = np.searchsorted(column, column + _WINDOW, side="right")
         counts = ends - np.arange(frames)
         best = int(np.argmax(counts))
         value = float(np.median(column[best : ends[best]]))
-        often, low = counts[best] >= _RESTING * frames, best <= _BELOW * frames
+        often = counts[best] >= max(_RESTING * frames, _FEWEST)
+        low = best <= _BELOW * frames
         if often and low and column[best] > 0.0 and value <= _LARGEST_REST:
             rest[k] = value
     return rest

@@ -51,6 +51,7 @@ def rig_health(
     held_out: Observations | None = None,
     priors: WeightPriors | None = None,
     transferred: Floats | None = None,
+    variation: float = Schedule.variation,
 ) -> dict[str, Any]:
     """Everything that can be told of a rig's health from what is at hand, ready for JSON.
 
@@ -61,6 +62,7 @@ def rig_health(
         held_out: frames that it was not solved on, in the same topology.
         priors: of the weights solved on held-out frames; the solver's own when None.
         transferred: (B, V, 3) the template's shapes on the actor, mm; made when None.
+        variation: expected departure of shapes from those, as a share of their displacement.
 
     Returns:
         a dict of the keys that docs/health.md lists; a key whose inputs are missing is None.
@@ -95,7 +97,7 @@ def rig_health(
             cosines, None if targets is None else overlaps(targets), rig.weights, rig.names
         ),
         "jitter": jitter_report(rig.weights, rig.deltas, contiguous, rig.names),
-        "captures": captures_report(rig, noise_mm, targets) | {"detail_lost": lost},
+        "captures": captures_report(rig, noise_mm, targets, variation) | {"detail_lost": lost},
         "mouth_close": mouth_close_report(rig, template),
     }
 
@@ -154,7 +156,12 @@ def detail_lost(rig: FaceRig, seen: Observations) -> dict[str, Any]:
     return _error(Fit(rig.neutral, rig.deltas, rig.weights, rig.head_from_rig), seen)
 
 
-def captures_report(rig: FaceRig, noise_mm: float, targets: Floats | None = None) -> dict[str, Any]:
+def captures_report(
+    rig: FaceRig,
+    noise_mm: float,
+    targets: Floats | None = None,
+    variation: float = Schedule.variation,
+) -> dict[str, Any]:
     """Leverage of each frame, frames to leave out, shapes left unknown, expressions to shoot next.
 
     Each shape is judged at the vertices it moves most (means weighted by squared displacement),
@@ -166,6 +173,7 @@ def captures_report(rig: FaceRig, noise_mm: float, targets: Floats | None = None
         rig: weights say what was captured; shapes that move nothing are left out.
         noise_mm: root mean square error of a captured vertex, mm.
         targets: (B, V, 3) the prior's shapes, mm; the rig's own when None.
+        variation: expected departure from them, as a share of their displacement.
     """
     shapes = rig.deltas if targets is None else targets
     square = np.einsum("bva,bva->bv", shapes, shapes)
@@ -175,7 +183,7 @@ def captures_report(rig: FaceRig, noise_mm: float, targets: Floats | None = None
     areas = total**2 / fourth / square.shape[1]  # of the vertices, as many as move like the strong
     captures = Captures(
         weights=rig.weights[:, moving],
-        ridge=noise_mm**2 * total / (Schedule().variation ** 2 * fourth),
+        ridge=noise_mm**2 * total / (variation**2 * fourth),
         areas=areas,
     )
     names = [name for name, moves in zip(rig.names, moving, strict=True) if moves]

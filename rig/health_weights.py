@@ -89,7 +89,7 @@ def gauge_report(
 def overlaps(deltas: Floats) -> Floats:
     """(B, B) cosines between shapes; 0 where one moves nothing."""
     check_shape(deltas=(deltas, "B V 3"))
-    flat = deltas.reshape(len(deltas), -1)
+    flat = deltas.reshape(len(deltas), 3 * deltas.shape[1])
     sizes = np.sqrt(np.einsum("bn,bn->b", flat, flat))
     unit = np.where(sizes > 1e-9, sizes, np.inf)
     cosines: Floats = (flat @ flat.T) / np.outer(unit, unit)
@@ -149,7 +149,7 @@ def jitter_report(
     check_shape(weights=(weights, "F B"), deltas=(deltas, "B V 3"), contiguous=(contiguous, "F"))
     middle = np.flatnonzero(contiguous[1:-1] & contiguous[2:]) + 1
     bend = weights[middle - 1] - 2.0 * weights[middle] + weights[middle + 1]
-    flat = deltas.reshape(len(deltas), -1)
+    flat = deltas.reshape(len(deltas), 3 * deltas.shape[1])
     gram = flat @ flat.T / max(deltas.shape[1], 1)
     square = np.maximum(np.einsum("fb,bc,fc->f", bend, gram, bend), 0.0)
     starts = np.flatnonzero(~contiguous)

@@ -8,10 +8,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from capture.arrays import Bools, Floats, Ints
+from capture.errors import InputError
 from capture.progress import Progress, silent
 from rig.evidence import Evidence
-from rig.fit import Fit, Observations, undo_motion, weighted_rms
-from rig.solve import Problem, Schedule, pose_problem, shape_mask
+from rig.fit import Fit, Observations, weighted_rms
+from rig.overrides import override_evidence
+from rig.solve import (
+    Problem,
+    Schedule,
+    frames_evidence,
+    pose_problem,
+    shape_mask,
+    update_priors,
+)
 from rig.update import update_shapes
 
 _FOLDS = 4
@@ -52,14 +61,22 @@ def choose_strengths(
 
     Returns:
         the schedule with the best strengths, and every trial.
+
+    Raises:
+        InputError: when there is nothing to hold out.
     """
     schedule = problem.schedule
     trials: list[Trial] = []
-    total = len(_VARIATIONS) + len(_GRADIENTS_MM2) - 1
+    total = len(_VARIATIONS) + len(_GRADIENTS_MM2) + 1
     base = schedule.update.gradient_mm2
     best = schedule.variation
     folds = list(_folds(problem.seen))
-    for variation, gradient in _candidates(base):
+    if not folds:
+        raise InputError(
+            f"rig.hold_out wants frames to hold out: more than {_BLOCK} of one take, or several "
+            f"takes; found {len(problem.seen.points)}"
+        )
+    for variation, gradient in _candidates(schedule.variation, base):
         chosen = best if variation is None else variation
         if any((t.variation, t.gradient_mm2) == (chosen, gradient) for t in trials):
             continue
@@ -75,9 +92,9 @@ def choose_strengths(
     return replace(schedule, variation=winner.variation, update=update), trials
 
 
-def _candidates(base: float) -> Iterator[tuple[float | None, float]]:
+def _candidates(own: float, base: float) -> Iterator[tuple[float | None, float]]:
     """Variations at the base gradient first; then gradients, at the best variation by then."""
-    yield from ((variation, base) for variation in _VARIATIONS)
+    yield from ((variation, base) for variation in (own, *_VARIATIONS))
     yield from ((None, gradient) for gradient in _GRADIENTS_MM2)
 
 
@@ -96,17 +113,14 @@ def _folds(seen: Observations) -> Iterator[Bools]:
 def _held_out(problem: Problem, fit: Fit, targets: Floats, folds: list[Bools]) -> float:
     schedule, seen, template = problem.schedule, problem.seen, problem.template
     mask = shape_mask(problem)
-    offsets = undo_motion(fit, seen)
-    rms_mm = weighted_rms(fit.residuals(seen.points), seen.confidence)
-    priors = replace(
-        schedule.update,
-        relative_mm2=rms_mm**2 / 3.0 / schedule.variation**2,
-        extra_offset=mask.extra_offset,
-    )
+    priors = update_priors(problem, fit, mask)
+    whole = frames_evidence(problem, fit, targets)
     square, mass = 0.0, 0.0
     for out in folds:
         kept = ~out
-        evidence = Evidence(offsets[kept], seen.confidence[kept], fit.weights[kept])
+        evidence = Evidence(whole.offsets[kept], whole.confidence[kept], whole.weights[kept])
+        if problem.overrides:
+            evidence = evidence.with_rows(override_evidence(problem.overrides, template.names))
         shapes = update_shapes(
             fit.neutral,
             template.mesh.triangles,
@@ -117,7 +131,8 @@ def _held_out(problem: Problem, fit: Fit, targets: Floats, folds: list[Bools]) -
             fit.deltas,
         )
         part = Observations(
-            seen.points[out], seen.confidence[out], seen.contiguous[out],
+            seen.points[out], seen.confidence[out],
+            (seen.contiguous & np.concatenate([[False], out[:-1]]))[out],
             None if seen.weights is None else seen.weights[out],
         )  # fmt: skip
         posed = pose_problem(

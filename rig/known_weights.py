@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from capture.arrays import Floats
+from capture.arrays import Bools, Floats
 from capture.progress import Progress, silent
-from rig.contact import Contacts, closed_pairs, template_pairs
+from rig.contact import ContactRows, Contacts, closed_pairs, template_pairs
 from rig.ebfr import EbfrSettings, solve_ebfr
 from rig.evidence import Evidence
 from rig.fit import undo_motion
 from rig.hable import HableSettings, solve_hable
 from rig.influence import influence_masks
 from rig.menzel import MenzelSettings, solve_menzel
-from rig.overrides import override_evidence
+from rig.overrides import overridden, override_evidence
 from rig.solve import Problem, Solution, pose_problem, transferred
 
 _ROUNDS = 3  # of head motion and shapes: the motion hardly depends on the shapes
@@ -41,13 +41,13 @@ def solve_known(
     for turn in range(_ROUNDS if method != "transfer" else 0):
         evidence = Evidence(undo_motion(fit, problem.seen), problem.seen.confidence, fit.weights)
         contacts = _contacts(problem, neutral, evidence)
-        if problem.overrides:
+        if problem.overrides:  # the rows of contacts are weights, and stay valid
             evidence = evidence.with_rows(override_evidence(problem.overrides, template.names))
         deltas = _solve(problem, fit.neutral, targets, evidence, (method, contacts))
         fit = pose_problem(problem, (neutral, deltas), schedule.weights)
         progress(turn + 1, _ROUNDS, "rig")
     progress(_ROUNDS, _ROUNDS, "rig")
-    return Solution(first=first, fit=fit, turns=[], targets=targets, relative_mm2=0.0)
+    return Solution(first=first, fit=fit, turns=[], targets=targets, settled=True)
 
 
 def _solve(
@@ -55,29 +55,38 @@ def _solve(
     neutral: Floats,
     targets: Floats,
     evidence: Evidence,
-    chosen: tuple[str, Contacts | None],
+    chosen: tuple[str, ContactRows | None],
 ) -> Floats:
     method, contacts = chosen
     template = problem.template
+    told = overridden(problem.overrides, template.names, len(neutral))
     if method == "hable":
-        masks = influence_masks(template)
-        rows = None if contacts is None else contacts.rows(neutral, evidence.weights)
+        masks = np.maximum(influence_masks(template), told)
         return solve_hable(
-            neutral, template.polygons, targets, masks, evidence, HableSettings(), rows
+            neutral, template.polygons, targets, masks, evidence, HableSettings(), contacts
         )
     if method == "menzel":
-        return solve_menzel(targets, evidence, MenzelSettings(strength=_MENZEL_STRENGTH))
+        settings = MenzelSettings(strength=_MENZEL_STRENGTH)
+        return solve_menzel(targets, evidence, settings, _with_sculpts(problem, targets, told))
     return solve_ebfr(neutral, template.mesh.triangles, targets, evidence, EbfrSettings(beta=0.01))
 
 
-def _contacts(problem: Problem, neutral: Floats, evidence: Evidence) -> Contacts | None:
+def _with_sculpts(problem: Problem, targets: Floats, told: Bools) -> Floats:
+    """The targets, and what was sculpted where it was: how far each vertex is known to move."""
+    shapes = targets.copy()
+    for item in problem.overrides:
+        index = problem.template.names.index(item.name)
+        shapes[index, told[index]] = item.delta[told[index]]
+    return shapes
+
+
+def _contacts(problem: Problem, neutral: Floats, evidence: Evidence) -> ContactRows | None:
     """Lips and lids of the template that the frames show shut are to shut in the rig, too."""
     pairs = template_pairs(problem.template)
     if not pairs.size:
         return None
-    count = len(evidence.weights) + len(problem.overrides)
-    closed = np.zeros((count, len(pairs)), dtype=bool)
-    closed[: len(evidence.weights)] = closed_pairs(neutral, pairs, evidence)
+    closed = closed_pairs(neutral, pairs, evidence)
     if not closed.any():
         return None
-    return Contacts(pairs=pairs, closed=closed, kept=np.zeros_like(closed))
+    contacts = Contacts(pairs=pairs, closed=closed, kept=np.zeros_like(closed))
+    return contacts.rows(neutral, evidence.weights)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from capture.arrays import Ints
+from capture.arrays import Bools, Ints
 from capture.errors import raise_all
 from capture.names import known_hint
 from rig.naming import mirrored_name, side_of
@@ -16,7 +16,7 @@ from rig.weights import WeightLinks
 _ONE_SIDED = 0.8  # share of a shape's square displacement on its own half of the face
 
 
-def find_links(template: Template, exclusive: Sequence[str]) -> WeightLinks:
+def find_links(template: Template, kept: Bools, exclusive: Sequence[str]) -> WeightLinks:
     """Mirrored shapes of a template as symmetric pairs, and the pairs told as exclusive ones.
 
     Two shapes whose names mirror each other are symmetric if each acts on one half of the face:
@@ -24,6 +24,8 @@ def find_links(template: Template, exclusive: Sequence[str]) -> WeightLinks:
 
     Args:
         template: the artist's rig; x runs across the face.
+        kept: (B,) the shapes that are solved; the links count those alone, and pairs with
+            another shape fall away.
         exclusive: pairs such as "jawLeft:jawRight".
 
     Raises:
@@ -42,10 +44,8 @@ def find_links(template: Template, exclusive: Sequence[str]) -> WeightLinks:
         "rig.exclusive",
         [f"{name}: the template has no such shape; {known_hint(name, names)}" for name in unknown],
     )
-    return WeightLinks(
-        symmetric=_pairs(symmetric),
-        exclusive=_pairs([(names.index(first), names.index(other)) for first, other in told]),
-    )
+    excluded = [(names.index(first), names.index(other)) for first, other in told]
+    return WeightLinks(symmetric=_pairs(symmetric, kept), exclusive=_pairs(excluded, kept))
 
 
 def _one_sided(template: Template, shape: int) -> bool:
@@ -56,5 +56,7 @@ def _one_sided(template: Template, shape: int) -> bool:
     return max(left, float(square.sum()) - left) >= _ONE_SIDED * float(square.sum())
 
 
-def _pairs(pairs: Sequence[tuple[int, int]]) -> Ints:
-    return np.array(pairs, dtype=np.int64).reshape(-1, 2)
+def _pairs(pairs: Sequence[tuple[int, int]], kept: Bools) -> Ints:
+    number = np.cumsum(kept) - 1
+    solved = [(number[a], number[b]) for a, b in pairs if kept[a] and kept[b]]
+    return np.array(solved, dtype=np.int64).reshape(-1, 2)

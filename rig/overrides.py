@@ -104,8 +104,16 @@ def read_overrides(path: Path, out: Path | None = None) -> list[Override]:
     return found
 
 
-def check_overrides(overrides: Sequence[Override], names: Sequence[str], count: int) -> None:
-    """Refuse overrides of shapes that the template lacks, or of another vertex count.
+def check_overrides(
+    overrides: Sequence[Override], names: Sequence[str], moving: Bools, count: int
+) -> None:
+    """Refuse overrides of shapes that the template lacks or leaves empty, or of another topology.
+
+    Args:
+        overrides: the artist's word.
+        names: B shapes of the template.
+        moving: (B,) which of them move anything.
+        count: vertices of the template.
 
     Raises:
         InputError: listing them all.
@@ -114,6 +122,11 @@ def check_overrides(overrides: Sequence[Override], names: Sequence[str], count: 
         f"{item.name}: the template has no such shape; {known_hint(item.name, names)}"
         for item in overrides
         if item.name not in names
+    ]
+    problems += [
+        f"{item.name}: moves nothing in the template: no shape to solve; sculpt it there instead"
+        for item in overrides
+        if item.name in names and not moving[list(names).index(item.name)]
     ]
     problems += [
         f"{item.name}: {len(item.delta)} vertices, the template has {count}"
@@ -137,14 +150,13 @@ def override_evidence(overrides: Sequence[Override], names: Sequence[str]) -> Ev
     return Evidence(offsets, confidence, weights, np.zeros(len(kept)))
 
 
-def widened_support(support: Bools, overrides: Sequence[Override], names: Sequence[str]) -> Bools:
-    """The locality mask (B, V) or (B, V, 3), opened where an override moves a vertex."""
-    wide = support.copy()
+def overridden(overrides: Sequence[Override], names: Sequence[str], count: int) -> Bools:
+    """Where an override moves a vertex of its shape: (B, V)."""
+    moved = np.zeros((len(names), count), dtype=bool)
     for item in overrides:
-        if item.name in names:
-            moved = item.touched & (np.linalg.norm(item.delta, axis=1) > _TOUCHED_MM)
-            wide[list(names).index(item.name), moved] = True
-    return wide
+        far = item.touched & (np.linalg.norm(item.delta, axis=1) > _TOUCHED_MM)
+        moved[list(names).index(item.name)] = far
+    return moved
 
 
 _KEYS = ("base", "override")

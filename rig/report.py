@@ -48,10 +48,7 @@ def describe_solve(
         "residual_per_frame_mm": _per_frame(residuals[1], seen.confidence),
         "worst_mm": float(residuals[1].max()),
         "worst_vertex": int(np.unravel_index(int(residuals[1].argmax()), residuals[1].shape)[1]),
-        "iterations": [
-            {**dataclasses.asdict(turn), "total": turn.total, "settled": index + 1 == len(turns)}
-            for index, turn in enumerate(turns)
-        ],
+        "iterations": [{**dataclasses.asdict(turn), "total": turn.total} for turn in turns],
         "frames": len(last.weights),
         "shapes": len(template.names),
         "weights_known": seen.weights is not None,

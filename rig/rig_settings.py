@@ -90,12 +90,15 @@ class RigSettings:
             gradient_mm2=(0.0, 1e6), offset=(1e-6, 1e6), neutral_offset=(1e-6, 1e6),
             mask_tolerance=(0.0, 0.5), neutral_frame=(-1, 1_000_000),
         )  # fmt: skip
-        wrong = [pair for pair in self.exclusive if len(pair.split(":")) != 2]
+        pairs = [[name.strip() for name in pair.split(":")] for pair in self.exclusive]
+        wrong = [pair for pair in pairs if len(pair) != 2 or pair[0] == pair[1]]
         if wrong:
             raise SettingsError(
-                f"rig.exclusive = {list(self.exclusive)}: expected pairs such as "
-                f'"jawLeft:jawRight", found {wrong[0]!r}'
+                f"rig.exclusive = {list(self.exclusive)}: expected pairs of two shapes such as "
+                f'"jawLeft:jawRight", found {":".join(wrong[0])!r}'
             )
+        if self.hold_out and self.method != "ma":
+            raise SettingsError(f'rig.hold_out goes with method = "ma", found "{self.method}"')
 
     def schedule(self) -> Schedule:
         """The same settings as the solver takes them."""

@@ -17,11 +17,12 @@ from rig.gauge import (
     repetition,
     resting_weights,
     shape_sizes,
+    without_gaps,
 )
 from rig.gradient import gradient_operator
 from rig.locality import Locality, Mask, mask_shapes
 from rig.neutral_frame import rigid_weights
-from rig.overrides import Override, override_evidence, widened_support
+from rig.overrides import Override, overridden, override_evidence
 from rig.template import Template
 from rig.transfer import transfer_shapes
 from rig.transfer_rbf import WarpSettings, transfer_shapes_rbf
@@ -35,11 +36,13 @@ __all__ = [
     "Problem",
     "Schedule",
     "Solution",
+    "frames_evidence",
     "personalise",
     "pose_frames",
     "pose_problem",
     "shape_mask",
     "transferred",
+    "update_priors",
     "weighted_rms",
 ]
 
@@ -135,14 +138,14 @@ class Solution:
         fit: of the refined rig.
         turns: of the alternation.
         targets: (B, V, 3) the template's shapes transferred to the refined neutral, mm.
-        relative_mm2: strength that `variation` came to in the last turn.
+        settled: whether the energy settled; False when the turns ran out.
     """
 
     first: Fit
     fit: Fit
     turns: list[Iteration]
     targets: Floats
-    relative_mm2: float
+    settled: bool
 
 
 def pose_frames(
@@ -181,8 +184,34 @@ def shape_mask(problem: Problem) -> Mask:
     """Where each shape may move: by the template, and where an override says so."""
     schedule, template = problem.schedule, problem.template
     mask = mask_shapes(template, Locality(mode=schedule.mask, tolerance=schedule.mask_tolerance))
-    support = widened_support(mask.support, problem.overrides, template.names)
-    return replace(mask, support=support)
+    told = overridden(problem.overrides, template.names, len(template.neutral))
+    each = told if mask.support.ndim == 2 else told[:, :, None]
+    extra = None if mask.extra_offset is None else np.where(told, 0.0, mask.extra_offset)
+    return Mask(mask.support | each, extra)
+
+
+def update_priors(problem: Problem, fit: Fit, mask: Mask) -> UpdatePriors:
+    """Bayes' shrinkage: variance of the noise, per coordinate, over that of the departure."""
+    schedule, seen = problem.schedule, problem.seen
+    rms_mm = weighted_rms(fit.residuals(seen.points), seen.confidence)
+    noise_mm2 = max(rms_mm, _NOISE_FLOOR_MM) ** 2 / 3.0
+    return replace(
+        schedule.update,
+        relative_mm2=noise_mm2 / schedule.variation**2,
+        extra_offset=mask.extra_offset,
+    )
+
+
+def frames_evidence(problem: Problem, fit: Fit, targets: Floats) -> Evidence:
+    """The frames; what shapes that were hardly exercised show is taken off, as not theirs."""
+    seen = problem.seen
+    offsets = undo_motion(fit, seen)
+    if seen.weights is not None:
+        return Evidence(offsets, seen.confidence, fit.weights)
+    told = np.isin(problem.template.names, [item.name for item in problem.overrides])
+    resting = (fit.weights.max(axis=0, initial=0.0) < EXERCISED) & ~told
+    offsets -= np.tensordot(fit.weights[:, resting], targets[resting], axes=1)
+    return Evidence(offsets, seen.confidence, np.where(resting, 0.0, fit.weights))
 
 
 def transferred(template: Template, neutral: Floats, schedule: Schedule) -> Floats:
@@ -241,7 +270,6 @@ class _Alternation:
         self._fit = self._first
         self._repeated = repetition(self._first.weights, problem.seen.contiguous)
         self._turns: list[Iteration] = []
-        self._relative_mm2 = 0.0
         if problem.seen.weights is None:
             self.pose(0)
 
@@ -255,8 +283,8 @@ class _Alternation:
             self._targets = self._original * sizes[:, None, None]
         if self._schedule.rescale:
             fit = self._fix_gauge(fit)
-        priors = self._priors(fit)
-        evidence = self._evidence(fit)
+        priors = update_priors(self._problem, fit, self._mask)
+        evidence = frames_evidence(self._problem, fit, self._targets)
         if self._artist is not None:
             evidence = evidence.with_rows(self._artist)
         neutral, deltas = update_shapes(
@@ -269,18 +297,7 @@ class _Alternation:
             fit.deltas,
         )
         self._fit = Fit(neutral, deltas, fit.weights, fit.motions)
-        self._relative_mm2 = priors.relative_mm2
         self._turns.append(self._measure(fit.neutral, priors))
-
-    def _evidence(self, fit: Fit) -> Evidence:
-        """The frames; what shapes that were hardly exercised show is taken off, as not theirs."""
-        seen = self._problem.seen
-        offsets = undo_motion(fit, seen)
-        if seen.weights is not None:
-            return Evidence(offsets, seen.confidence, fit.weights)
-        resting = (fit.weights.max(axis=0, initial=0.0) < EXERCISED) & ~self._held
-        offsets -= np.tensordot(fit.weights[:, resting], self._targets[resting], axes=1)
-        return Evidence(offsets, seen.confidence, np.where(resting, 0.0, fit.weights))
 
     def pose(self, turn: int) -> None:
         """Solve weights and head motion, with room above 1 that the gauge takes back."""
@@ -306,7 +323,7 @@ class _Alternation:
         )  # fmt: skip
         return Solution(
             first=self._first, fit=fit, turns=self._turns, targets=self._original,
-            relative_mm2=self._relative_mm2,
+            settled=self.settled(),
         )  # fmt: skip
 
     def _transferred(self, neutral: Floats) -> Floats:
@@ -321,26 +338,17 @@ class _Alternation:
             sizes = shape_sizes(fit.deltas, self._original)
             self._targets = self._original * sizes[:, None, None]
             return fit
-        rest = resting_weights(fit.weights)
+        looked = np.asarray(seen.confidence.any(axis=1))
+        rest = resting_weights(fit.weights[looked])
         neutral = fit.neutral + np.tensordot(rest, fit.deltas, axes=1)
         weights = np.maximum(fit.weights - rest, 0.0)
         sizes = shape_sizes(fit.deltas, self._original)
-        scales = choose_scales(weights, seen.contiguous, sizes, self._schedule.size_variation)
+        kept, linked = without_gaps(looked, seen.contiguous)
+        scales = choose_scales(weights[kept], linked, sizes, self._schedule.size_variation)
         scales[self._held] = 1.0
         deltas = fit.deltas * scales[:, None, None]
         self._targets = self._original * np.maximum(sizes * scales, 0.0)[:, None, None]
         return Fit(neutral, deltas, np.minimum(weights / scales, 1.0), fit.motions)
-
-    def _priors(self, fit: Fit) -> UpdatePriors:
-        """Bayes' shrinkage: variance of the noise, per coordinate, over that of the departure."""
-        seen = self._problem.seen
-        rms_mm = weighted_rms(fit.residuals(seen.points), seen.confidence)
-        noise_mm2 = max(rms_mm, _NOISE_FLOOR_MM) ** 2 / 3.0
-        return replace(
-            self._schedule.update,
-            relative_mm2=noise_mm2 / self._schedule.variation**2,
-            extra_offset=self._mask.extra_offset,
-        )
 
     def _measure(self, rest: Floats, priors: UpdatePriors) -> Iteration:
         """Energies of the updated rig at the weights it was solved with; `rest` (V, 3) before."""

@@ -75,7 +75,11 @@ def solve_rig(
     """
     started = time.monotonic()
     check_match(template, performances)
-    check_overrides(overrides, template.names, len(template.neutral))
+    if held_out:
+        check_match(template, held_out, [f"held-out {n + 1}" for n in range(len(held_out))])
+    check_overrides(overrides, template.names, template.moves(), len(template.neutral))
+    if overrides and settings.method == "transfer":
+        raise InputError('rig.method = "transfer" solves nothing that could obey an override')
     known = _known_weights(template, performances, weights)
     if known is None and settings.method != "ma":
         raise InputError(
@@ -97,19 +101,18 @@ def solve_rig(
     neutral = approximate_neutral(solvable, seen.points[frame], seen.confidence[frame])
     problem = Problem(
         template=solvable, seen=seen, schedule=settings.schedule(), overrides=tuple(overrides),
-        links=_links(solvable, settings), rigid=_rigid(template, settings),
+        links=_links(template, moving, settings), rigid=_rigid(template, settings),
     )  # fmt: skip
     solution, chosen = _solve(problem, neutral, settings, progress)
     rig = _whole_rig(template, moving, solution.fit)
     report = describe_solve(template, moving, seen, (solution.first, solution.fit), solution.turns)
-    report |= {"method": settings.method, "neutral_frame": frame}
-    report |= {"overrides": [item.name for item in overrides], "hold_out": chosen}
-    report["best_fit"] = _best_fit(seen, solution.first, solution.fit)
+    report |= _told(problem, solution, settings)
+    report |= {"neutral_frame": frame, "hold_out": chosen}
     report["topology_matches"] = _same_topology(template, performances)
     carried = _whole_deltas(template, moving, solution.targets)
     report["health"] = rig_health(
         rig, template, seen=seen, held_out=observe(held_out) if held_out else None,
-        priors=settings.schedule().weights, transferred=carried,
+        priors=settings.schedule().weights, transferred=carried, variation=settings.variation,
     )  # fmt: skip
     report["seconds"] = round(time.monotonic() - started, 3)
     write_report(products[2], report)
@@ -139,6 +142,17 @@ def _solve(
     return personalise(replace(problem, schedule=schedule), neutral, progress), chosen
 
 
+def _told(problem: Problem, solution: Solution, settings: RigSettings) -> dict[str, Any]:
+    """What the solve itself says, for the report."""
+    return {
+        "method": settings.method,
+        "settled": solution.settled,
+        "unseen_frames": int((~problem.seen.confidence.any(axis=1)).sum()),
+        "overrides": [item.name for item in problem.overrides],
+        "best_fit": _best_fit(problem.seen, solution.first, solution.fit),
+    }
+
+
 def check_match(
     template: Template,
     performances: Sequence[Performance],
@@ -165,7 +179,7 @@ def check_match(
         if performance.vertices.shape[1] != wanted
     ]
     raise_all("rig", problems)
-    if not any((p.confidence > 0).any() for p in performances):
+    if not any((_confidence(p) > 0).any() for p in performances):
         raise InputError("rig: no vertex of any frame has confidence above 0: nothing to fit")
     if not template.moves().any():
         raise InputError("rig: no shape of the template moves any vertex: nothing to personalise")
@@ -174,15 +188,20 @@ def check_match(
 def observe(performances: Sequence[Performance], known: Floats | None = None) -> Observations:
     """All frames of all performances, one after the other; contiguity ends at each boundary."""
     points = np.concatenate([p.vertices for p in performances]).astype(np.float64)
-    confidence = np.concatenate([p.confidence for p in performances]).astype(np.float64)
-    confidence = np.clip(confidence, 0.0, 1.0)
-    unfit = ~np.isfinite(points).all(axis=2)
-    confidence[unfit] = 0.0
+    confidence = np.concatenate([_confidence(p) for p in performances])
     points[confidence <= 0.0] = 0.0
     contiguous = np.concatenate(
         [np.concatenate([[False], np.diff(p.frames) == 1])[: len(p.frames)] for p in performances]
     )
     return Observations(points, confidence, contiguous, known)
+
+
+def _confidence(performance: Performance) -> Floats:
+    """Confidence in 0..1, 0 where it or the vertex is not a number."""
+    given = np.nan_to_num(np.asarray(performance.confidence, dtype=np.float64), nan=0.0)
+    finite = np.isfinite(performance.vertices).all(axis=2)
+    sure: Floats = np.where(finite, np.clip(given, 0.0, 1.0), 0.0)
+    return sure
 
 
 def _known_weights(
@@ -203,6 +222,9 @@ def _known_weights(
 
 
 def _neutral_frame(template: Template, seen: Observations, asked: int) -> int:
+    if asked < 0 and seen.weights is not None:
+        total = np.where(seen.confidence.any(axis=1), seen.weights.sum(axis=1), np.inf)
+        return int(np.argmin(total))
     if asked < 0:
         return choose_neutral_frame(template, seen.points, seen.confidence)
     if asked >= len(seen.points):
@@ -229,8 +251,8 @@ def _best_fit(seen: Observations, *fits: Fit) -> dict[str, float]:
     }
 
 
-def _links(template: Template, settings: RigSettings) -> WeightLinks:
-    found = find_links(template, settings.exclusive)
+def _links(template: Template, moving: Bools, settings: RigSettings) -> WeightLinks:
+    found = find_links(template, moving, settings.exclusive)
     return found if settings.symmetry > 0.0 else replace(found, symmetric=found.symmetric[:0])
 
 

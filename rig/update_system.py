@@ -37,7 +37,7 @@ class UpdatePriors:
         extra_offset: (B, V) >= 0, added to the strength of E_d too (a soft mask), or None.
     """
 
-    gradient_mm2: float = 1.0
+    gradient_mm2: float = 10.0
     offset: float = 0.05
     relative_mm2: float = 0.3
     neutral_offset: float = 0.05

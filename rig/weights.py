@@ -77,15 +77,15 @@ class WeightPriors:
     """
 
     sparsity: Literal["squared", "l1", "reweighted"] = "squared"
-    sparsity_mm2: float = 0.03
-    l1_mm2: float = 0.03
+    sparsity_mm2: float = 0.01
+    l1_mm2: float = 0.02
     reweighted_mm2: float = 0.01
     reweight_floor: float = 0.1
     reweight_rounds: int = 4
     temporal: Literal["causal", "joint"] = "causal"
     smoothness: float = 0.002
-    symmetry: float = 0.05
-    evidence: float = 0.2
+    symmetry: float = 0.0
+    evidence: float = 0.12
     debias: bool = True
     active_above: float = 0.01
     upper: float = 1.0

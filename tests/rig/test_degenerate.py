@@ -119,3 +119,13 @@ def test_a_rig_of_full_size_takes_less_than_a_second_of_cpu() -> None:
         spent.append(time.thread_time() - start)
     assert min(spent) < 1.0  # 0.05 to 0.1 s on one thread
     assert found.condition < 1.3
+
+
+def test_a_rig_without_any_usable_shape_is_told_of() -> None:
+    rng = np.random.default_rng(3)
+    neutral = rng.normal(size=(40, 3)) * 60.0
+    names = ("a", "b")
+    empty = find_degenerate(np.zeros((2, 40, 3)), names, neutral).as_report()
+    assert empty["zero"] == ["a", "b"]
+    whole = find_degenerate(neutral + rng.normal(size=(2, 40, 3)), names, neutral).as_report()
+    assert set(whole["not_shapes"]) == {"a", "b"}

@@ -3,7 +3,14 @@
 import numpy as np
 import pytest
 
-from rig.gauge import choose_scales, count_peaks, repetition, resting_weights, shape_sizes
+from rig.gauge import (
+    choose_scales,
+    count_peaks,
+    repetition,
+    resting_weights,
+    shape_sizes,
+    without_gaps,
+)
 from rig.solve import Schedule
 from rig.weights import WeightPriors
 
@@ -110,3 +117,17 @@ def test_activity_is_priced_high_at_first_only_where_shapes_are_seen_in_combinat
     assert schedule.relaxed(11, 6.0)
     off = Schedule(strict_evidence=0.6, weights=WeightPriors(evidence=0.0))
     assert off.posing(0, 6.0).evidence == 0.0
+
+
+def test_a_gap_inside_a_take_does_not_end_an_activation() -> None:
+    seen = np.array([True, True, False, False, True, True, True])
+    take = np.array([False, True, True, True, True, False, True])
+    kept, linked = without_gaps(seen, take)
+    assert kept.tolist() == [0, 1, 4, 5, 6]
+    assert linked.tolist() == [False, True, True, False, True]
+
+
+def test_few_frames_agree_on_nothing() -> None:
+    assert resting_weights(np.array([[0.3]])).tolist() == [0.0]
+    assert resting_weights(np.array([[0.3], [0.3], [0.3]])).tolist() == [0.0]
+    assert resting_weights(np.zeros((0, 2))).tolist() == [0.0, 0.0]

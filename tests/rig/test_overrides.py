@@ -11,9 +11,9 @@ from rig.face_rig import FaceRig, write_rig
 from rig.overrides import (
     Override,
     check_overrides,
+    overridden,
     override_evidence,
     read_overrides,
-    widened_support,
 )
 from tests.rig.grid_face import grid_template
 
@@ -108,19 +108,21 @@ def test_each_row_shows_one_shape_alone() -> None:
     assert (rows.offsets[0, 30:] == 0.0).all()
 
 
-def test_the_mask_opens_where_the_artist_moved_a_vertex() -> None:
-    support = np.zeros((6, 400), dtype=bool)
+def test_an_override_moves_what_was_touched_and_moved() -> None:
     delta = np.zeros((400, 3))
     delta[:5] = 1.0
     touched = np.zeros(400, dtype=bool)
     touched[3:8] = True
-    wide = widened_support(support, [Override("jawOpen", delta, touched)], TEMPLATE.names)
-    assert np.argwhere(wide).tolist() == [[0, 3], [0, 4]]
+    moved = overridden([Override("jawOpen", delta, touched)], TEMPLATE.names, 400)
+    assert np.argwhere(moved).tolist() == [[0, 3], [0, 4]]
 
 
 def test_refuses_shapes_and_counts_that_do_not_fit() -> None:
     wrong = Override("jaw", np.zeros((7, 3)), np.ones(7, dtype=bool))
     with pytest.raises(InputError, match=r"(?s)jaw: the template has no such.*7 vertices"):
-        check_overrides([wrong], TEMPLATE.names, 400)
+        check_overrides([wrong], TEMPLATE.names, TEMPLATE.moves(), 400)
+    still = Override("still", np.ones((400, 3)), np.ones(400, dtype=bool))
+    with pytest.raises(InputError, match="still: moves nothing in the template"):
+        check_overrides([still], TEMPLATE.names, TEMPLATE.moves(), 400)
     with pytest.raises(InputError, match="strength must be above 0"):
         Override("jawOpen", np.zeros((4, 3)), np.ones(4, dtype=bool), strength=0.0)

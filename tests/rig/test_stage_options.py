@@ -12,7 +12,7 @@ from rig.overrides import Override
 from rig.stage import RigSettings, solve_rig
 from rig.template import read_template
 from rig.weight_table import WeightTable
-from tests.rig.grid_face import NAMES
+from tests.rig.grid_face import NAMES, performance_of
 from tests.rig.test_stage import Actor
 
 QUICK = RigSettings(iterations=2)
@@ -155,6 +155,70 @@ def test_refuses_choices_that_do_not_fit(actor: Actor, tmp_path: Path) -> None:
     bare.template = dataclasses.replace(bare.template, rigid_vertices=np.zeros(0, dtype=np.int64))
     with pytest.raises(InputError, match=r"three or more rigid_vertices, this one has 0"):
         _solve(bare, tmp_path, dataclasses.replace(QUICK, head="rigid"))
+
+
+def test_refuses_hold_out_without_frames_or_for_other_methods(actor: Actor, tmp_path: Path) -> None:
+    with pytest.raises(SettingsError, match=r'hold_out goes with method = "ma", found "ebfr"'):
+        RigSettings(method="ebfr", hold_out=True)
+    short = Actor(2, frames=6)
+    with pytest.raises(InputError, match=r"hold_out wants frames.* found 6"):
+        _solve(short, tmp_path, dataclasses.replace(QUICK, hold_out=True))
+
+
+def test_overrides_that_nothing_could_obey_are_refused(actor: Actor, tmp_path: Path) -> None:
+    everywhere = np.ones(400, dtype=bool)
+    still = Override("still", np.ones((400, 3)), everywhere)
+    with pytest.raises(InputError, match="still: moves nothing in the template"):
+        _solve(actor, tmp_path, overrides=[still])
+    jaw = Override("jawOpen", actor.deltas[0], everywhere)
+    settings = RigSettings(method="transfer")
+    with pytest.raises(InputError, match="nothing that could obey an override"):
+        _solve(actor, tmp_path, settings, weights=_known(actor), overrides=[jaw])
+
+
+@pytest.mark.parametrize("method", ["ma", "hable", "menzel"])
+def test_an_override_opens_the_mask(actor: Actor, tmp_path: Path, method: str) -> None:
+    far = np.linalg.norm(actor.template.neutral - actor.template.neutral[390], axis=1) < 25.0
+    assert not actor.template.support(1e-3)[0, far].any()
+    wanted = np.where(far[:, None], [0.0, 0.0, 1.0], actor.deltas[0])
+    told = Override("jawOpen", wanted, far, strength=1000.0)
+    mask = "soft" if method == "ma" else "vertex"
+    settings = RigSettings(method=method, iterations=2, mask=mask)
+    rig, _ = _solve(actor, tmp_path, settings, weights=_known(actor), overrides=[told])
+    assert np.linalg.norm(rig.deltas[0] - wanted, axis=1)[far].max() < 0.3
+
+
+def test_exclusive_pairs_with_an_empty_shape_are_borne(actor: Actor, tmp_path: Path) -> None:
+    _solve(actor, tmp_path, dataclasses.replace(QUICK, exclusive=("still:jawOpen",)))
+    with pytest.raises(SettingsError, match=r"found 'jawOpen:jawOpen'"):
+        RigSettings(exclusive=("jawOpen:jawOpen",))
+
+
+def test_numbers_that_are_none_count_as_unseen(actor: Actor, tmp_path: Path) -> None:
+    confidence = np.ones(actor.points.shape[:2])
+    confidence[3, 7] = np.nan
+    points = actor.points.copy()
+    points[4, 9] = np.inf
+    holes = confidence.copy()
+    holes[3, 7] = holes[4, 9] = 0.0
+    polygons = actor.template.polygons
+    dirty = solve_rig(
+        actor.template, [performance_of(points, polygons, confidence)], QUICK, tmp_path / "a"
+    )
+    clean = solve_rig(
+        actor.template, [performance_of(actor.points, polygons, holes)], QUICK, tmp_path / "b"
+    )
+    assert (dirty.deltas == clean.deltas).all()
+    nothing = performance_of(np.full_like(points, np.nan), polygons)
+    with pytest.raises(InputError, match="no vertex of any frame has confidence"):
+        solve_rig(actor.template, [nothing], QUICK, tmp_path / "c")
+
+
+def test_held_out_takes_are_checked_before_the_solve(actor: Actor, tmp_path: Path) -> None:
+    small = performance_of(actor.points[:, :361], actor.template.polygons[:1])
+    with pytest.raises(InputError, match="template has 400 vertices, held-out 1 361"):
+        _solve(actor, tmp_path / "rig", held_out=[small])
+    assert not (tmp_path / "rig").exists()
 
 
 def test_a_report_tells_health(actor: Actor, tmp_path: Path) -> None:

@@ -172,7 +172,7 @@ def test_factorises_small_or_stiff_systems_and_iterates_on_large_ones() -> None:
             priors.tolerance,
         )
 
-    loose = UpdatePriors(tolerance=1e-5)
+    loose = UpdatePriors(gradient_mm2=1.0, tolerance=1e-5)
     assert choice(8, loose)
     assert not choice(60, loose)
     assert choice(60, replace(loose, gradient_mm2=1e5, relative_mm2=0.0))

@@ -59,12 +59,18 @@ def run(arguments: Arguments, progress: Progress) -> dict[str, Any]:
     report: dict[str, Any] = {"out": str(arguments.out)}
     lateral_mm = None
     if arguments.mirror is not None and not isinstance(thing, WeightTable):
-        lateral_mm = find_mirror(read_template(arguments.mirror).neutral).lateral_mm(thing.neutral)
-    if isinstance(thing, WeightTable):
-        if arguments.split or arguments.mouth_close:
+        model = read_template(arguments.mirror).neutral
+        if model.shape != thing.neutral.shape:
             raise InputError(
-                f"{arguments.thing}: --split and --mouth-close need a rig or a template, this is "
-                "a table of weights"
+                f"{arguments.mirror}: {len(model)} vertices, {arguments.thing} has "
+                f"{len(thing.neutral)}: --mirror wants the same topology"
+            )
+        lateral_mm = find_mirror(model).lateral_mm(thing.neutral)
+    if isinstance(thing, WeightTable):
+        if arguments.split or arguments.mouth_close or arguments.mirror:
+            raise InputError(
+                f"{arguments.thing}: --split, --mirror and --mouth-close need a rig or a template, "
+                "this is a table of weights"
             )
     else:
         for name in arguments.split:

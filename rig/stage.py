@@ -78,14 +78,8 @@ def solve_rig(
     if held_out:
         check_match(template, held_out, [f"held-out {n + 1}" for n in range(len(held_out))])
     check_overrides(overrides, template.names, template.moves(), len(template.neutral))
-    if overrides and settings.method == "transfer":
-        raise InputError('rig.method = "transfer" solves nothing that could obey an override')
     known = _known_weights(template, performances, weights)
-    if known is None and settings.method != "ma":
-        raise InputError(
-            f'rig.method = "{settings.method}" wants known weights (--weights W.npz); '
-            'without them only "ma" solves'
-        )
+    _check_method(settings.method, known is not None, bool(overrides))
     product = Path(out) / "rig.npz"
     inputs = _hashes(template, performances, known) | _override_hashes(overrides)
     inputs |= {f"held_out_{n}": _performance_hash(p) for n, p in enumerate(held_out)}
@@ -140,6 +134,16 @@ def _solve(
         "trials": [dataclasses.asdict(trial) for trial in trials],
     }
     return personalise(replace(problem, schedule=schedule), neutral, progress), chosen
+
+
+def _check_method(method: str, known: bool, overridden: bool) -> None:
+    if overridden and method == "transfer":
+        raise InputError('rig.method = "transfer" solves nothing that could obey an override')
+    if not known and method != "ma":
+        raise InputError(
+            f'rig.method = "{method}" wants known weights (--weights W.npz); without them only '
+            '"ma" solves'
+        )
 
 
 def _told(problem: Problem, solution: Solution, settings: RigSettings) -> dict[str, Any]:

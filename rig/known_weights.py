@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from capture.arrays import Bools, Floats
+from capture.arrays import Floats
 from capture.progress import Progress, silent
 from rig.contact import ContactRows, Contacts, closed_pairs, template_pairs
 from rig.ebfr import EbfrSettings, solve_ebfr
@@ -13,7 +13,7 @@ from rig.fit import undo_motion
 from rig.hable import HableSettings, solve_hable
 from rig.influence import influence_masks
 from rig.menzel import MenzelSettings, solve_menzel
-from rig.overrides import overridden, override_evidence
+from rig.overrides import overridden, override_evidence, sculpted
 from rig.solve import Problem, Solution, pose_problem, transferred
 
 _ROUNDS = 3  # of head motion and shapes: the motion hardly depends on the shapes
@@ -67,17 +67,9 @@ def _solve(
         )
     if method == "menzel":
         settings = MenzelSettings(strength=_MENZEL_STRENGTH)
-        return solve_menzel(targets, evidence, settings, _with_sculpts(problem, targets, told))
+        sculpts = sculpted(targets, problem.overrides, template.names)
+        return solve_menzel(targets, evidence, settings, sculpts)
     return solve_ebfr(neutral, template.mesh.triangles, targets, evidence, EbfrSettings(beta=0.01))
-
-
-def _with_sculpts(problem: Problem, targets: Floats, told: Bools) -> Floats:
-    """The targets, and what was sculpted where it was: how far each vertex is known to move."""
-    shapes = targets.copy()
-    for item in problem.overrides:
-        index = problem.template.names.index(item.name)
-        shapes[index, told[index]] = item.delta[told[index]]
-    return shapes
 
 
 def _contacts(problem: Problem, neutral: Floats, evidence: Evidence) -> ContactRows | None:

@@ -150,6 +150,14 @@ def override_evidence(overrides: Sequence[Override], names: Sequence[str]) -> Ev
     return Evidence(offsets, confidence, weights, np.zeros(len(kept)))
 
 
+def sculpted(shapes: Floats, overrides: Sequence[Override], names: Sequence[str]) -> Floats:
+    """Shapes (B, V, 3) with the artist's where he touched them: what they are drawn to."""
+    told = shapes.copy()
+    for item in overrides:
+        told[list(names).index(item.name), item.touched] = item.delta[item.touched]
+    return told
+
+
 def overridden(overrides: Sequence[Override], names: Sequence[str], count: int) -> Bools:
     """Where an override moves a vertex of its shape: (B, V)."""
     moved = np.zeros((len(names), count), dtype=bool)

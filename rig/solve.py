@@ -22,7 +22,7 @@ from rig.gauge import (
 from rig.gradient import gradient_operator
 from rig.locality import Locality, Mask, mask_shapes
 from rig.neutral_frame import rigid_weights
-from rig.overrides import Override, overridden, override_evidence
+from rig.overrides import Override, overridden, override_evidence, sculpted
 from rig.template import Template
 from rig.transfer import transfer_shapes
 from rig.transfer_rbf import WarpSettings, transfer_shapes_rbf
@@ -50,6 +50,7 @@ _NOISE_FLOOR_MM = 0.05  # what tracking is never better than
 _RETRANSFER_MM = 0.05  # root mean square move of the neutral that makes the transfer stale
 _RELAXING = 0.8  # of the strict evidence is asked in the next turn
 _FEW_REPEATS, _MANY_REPEATS = 1.5, 3.5  # activations a shape: not strict, fully strict
+_STIFF_FIRST = 6.0  # how much stiffer shapes are at the first update; halved at each one after
 _LOOSE_UPPER = 1.5  # bound of weights between turns: the gauge, not the box, sets a shape's size
 
 
@@ -283,7 +284,13 @@ class _Alternation:
             self._targets = self._original * sizes[:, None, None]
         if self._schedule.rescale:
             fit = self._fix_gauge(fit)
+        self._targets = sculpted(
+            self._targets, self._problem.overrides, self._problem.template.names
+        )
         priors = update_priors(self._problem, fit, self._mask)
+        if self._problem.seen.weights is None:  # who did what is not yet sure: learn slowly
+            early = 1.0 + _STIFF_FIRST * 0.5 ** len(self._turns)
+            priors = replace(priors, relative_mm2=priors.relative_mm2 * early)
         evidence = frames_evidence(self._problem, fit, self._targets)
         if self._artist is not None:
             evidence = evidence.with_rows(self._artist)

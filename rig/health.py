@@ -105,14 +105,9 @@ def rig_health(
 def transferred_shapes(template: Template, neutral: Floats) -> Floats:
     """The template's shapes (B, V, 3) on another neutral, mm; those that move nothing as zeros."""
     moving = template.moves()
-    kept = replace(
-        template,
-        deltas=template.deltas[moving],
-        names=tuple(n for n, m in zip(template.names, moving, strict=True) if m),
-    )
     targets = np.zeros(template.deltas.shape)
     if moving.any():
-        targets[moving] = transfer_shapes(kept, neutral)
+        targets[moving] = transfer_shapes(template.with_shapes(moving), neutral)
     return targets
 
 

@@ -15,9 +15,9 @@ from capture.arrays import Bools, Floats, Ints, Ints32, check_shape
 from capture.errors import ShapeError
 from recon.mesh import vertex_normals
 from track.openings import Opening, find_openings
+from track.opposed import nearer_seeds
 
 _REACH = 0.5  # of a slit's width: how far along the surface a side reaches from its rim
-_BETWEEN_MM = 1.0  # nearer than this to both rims is a corner, of neither side
 _TOUCHING_MM = 6.0  # along the surface: how far sides reach beyond the vertices that touch
 _CONTACT_MM = 1.5  # vertices that face each other and are no further apart touch
 _ALONG_MM = 5.0  # unless they are nearer than this along the mesh: then it is a crease
@@ -91,12 +91,12 @@ def find_slits(vertices: Floats, triangles: Ints32) -> list[Slit]:
     for opening in find_openings(vertices, triangles):
         ends = vertices[opening.corners]
         reach = _REACH * float(np.linalg.norm(ends[0] - ends[1]))
-        side = _nearer((opening.first, opening.second), reach, graph)
+        side = nearer_seeds((opening.first, opening.second), reach, graph)
         if (side == 1).any() and (side == -1).any():
             taken |= side != 0
             found.append(_slit(vertices, side, opening))
     for seeds in _touching(_contacts(vertices, triangles, graph, ~taken), graph):
-        side = _nearer(seeds, _TOUCHING_MM, graph)
+        side = nearer_seeds(seeds, _TOUCHING_MM, graph)
         if (side == 1).any() and (side == -1).any():
             found.append(_slit(vertices, side, None))
     return found
@@ -214,18 +214,6 @@ def _slit(vertices: Floats, side: Ints, opening: Opening | None) -> Slit:
         ends = vertices[opening.corners]
         middle, width = ends.mean(axis=0), float(np.linalg.norm(ends[0] - ends[1]))
     return Slit(side=side, opening=opening, centre=middle, across=one - two, width_mm=width)
-
-
-def _nearer(seeds: tuple[Ints, Ints], reach_mm: float, graph: sparse.csr_array) -> Ints:
-    """1 and -1 where the first or the second seeds are nearer along the mesh, within reach."""
-    label = np.zeros(graph.shape[0], dtype=np.int64)
-    if min(map(len, seeds)) == 0:
-        return label
-    limit = reach_mm + 2.0 * _BETWEEN_MM
-    one, two = (csgraph.dijkstra(graph, indices=seed, min_only=True, limit=limit) for seed in seeds)
-    label[(one < reach_mm) & (one < two - _BETWEEN_MM)] = 1
-    label[(two < reach_mm) & (two < one - _BETWEEN_MM)] = -1
-    return label
 
 
 def _contacts(vertices: Floats, triangles: Ints32, graph: sparse.csr_array, free: Bools) -> Ints:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
 
-from capture.arrays import Floats
+from capture.arrays import Bools, Floats
 from capture.progress import Progress, silent
 from rig.evidence import Evidence
 from rig.fit import Fit, Iteration, Observations, undo_motion, weighted_rms
@@ -129,6 +130,12 @@ class Problem:
     links: WeightLinks = field(default_factory=WeightLinks)
     rigid: bool = False
 
+    @cached_property
+    def told(self) -> Bools:
+        """(B,) which shapes the artist has a word on."""
+        found: Bools = np.isin(self.template.names, [item.name for item in self.overrides])
+        return found
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Solution:
@@ -155,12 +162,24 @@ def pose_frames(
     seen: Observations,
     priors: WeightPriors,
     start: Floats | None = None,
+    links: WeightLinks | None = None,
+    rigid: Floats | None = None,
 ) -> Fit:
-    """Weights and head motion of every frame for a given neutral and shapes."""
-    sums = sum_frames(neutral, deltas, seen.points, seen.confidence)
+    """Weights and head motion of every frame for a given neutral and shapes.
+
+    Args:
+        neutral: (V, 3) mm.
+        deltas: (B, V, 3) mm.
+        seen: the frames; weights known in them are kept.
+        priors: of the weights.
+        start: (F, B) guess, or None.
+        links: symmetric and exclusive shapes.
+        rigid: (V,) weights of the vertices that place the head alone, or None.
+    """
+    sums = sum_frames(neutral, deltas, seen.points, seen.confidence, rigid)
     if seen.weights is not None:
         return Fit(neutral, deltas, seen.weights, place_heads(sums, seen.weights))
-    weights, motions = solve_weights(sums, seen.contiguous, priors, start)
+    weights, motions = solve_weights(sums, seen.contiguous, priors, start, links)
     return Fit(neutral, deltas, weights, motions)
 
 
@@ -171,14 +190,8 @@ def pose_problem(
     start: Floats | None = None,
 ) -> Fit:
     """The same with the problem's links and rigid vertices, for shapes (neutral, deltas)."""
-    neutral, deltas = shapes
-    seen = problem.seen
-    rigid = rigid_weights(problem.template, np.ones(len(neutral))) if problem.rigid else None
-    sums = sum_frames(neutral, deltas, seen.points, seen.confidence, rigid)
-    if seen.weights is not None:
-        return Fit(neutral, deltas, seen.weights, place_heads(sums, seen.weights))
-    weights, motions = solve_weights(sums, seen.contiguous, priors, start, problem.links)
-    return Fit(neutral, deltas, weights, motions)
+    rigid = rigid_weights(problem.template, np.ones(len(shapes[0]))) if problem.rigid else None
+    return pose_frames(*shapes, problem.seen, priors, start, problem.links, rigid)
 
 
 def shape_mask(problem: Problem) -> Mask:
@@ -209,8 +222,7 @@ def frames_evidence(problem: Problem, fit: Fit, targets: Floats) -> Evidence:
     offsets = undo_motion(fit, seen)
     if seen.weights is not None:
         return Evidence(offsets, seen.confidence, fit.weights)
-    told = np.isin(problem.template.names, [item.name for item in problem.overrides])
-    resting = (fit.weights.max(axis=0, initial=0.0) < EXERCISED) & ~told
+    resting = (fit.weights.max(axis=0, initial=0.0) < EXERCISED) & ~problem.told
     offsets -= np.tensordot(fit.weights[:, resting], targets[resting], axes=1)
     return Evidence(offsets, seen.confidence, np.where(resting, 0.0, fit.weights))
 
@@ -261,8 +273,7 @@ class _Alternation:
         names = problem.template.names
         self._problem, self._schedule = problem, schedule
         self._mask = shape_mask(problem)
-        self._held = np.isin(names, [item.name for item in problem.overrides])
-        self._artist = override_evidence(problem.overrides, names) if self._held.any() else None
+        self._artist = override_evidence(problem.overrides, names) if problem.overrides else None
         self._triangles = problem.template.mesh.triangles
         self._carried = neutral
         self._original = self._transferred(neutral)
@@ -352,7 +363,7 @@ class _Alternation:
         sizes = shape_sizes(fit.deltas, self._original)
         kept, linked = without_gaps(looked, seen.contiguous)
         scales = choose_scales(weights[kept], linked, sizes, self._schedule.size_variation)
-        scales[self._held] = 1.0
+        scales[self._problem.told] = 1.0
         deltas = fit.deltas * scales[:, None, None]
         self._targets = self._original * np.maximum(sizes * scales, 0.0)[:, None, None]
         return Fit(neutral, deltas, np.minimum(weights / scales, 1.0), fit.motions)

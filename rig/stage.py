@@ -89,7 +89,7 @@ def solve_rig(
         progress(1, 1, "rig")
         return read_rig(product)
     moving = template.moves()
-    solvable = _with_shapes(template, moving)
+    solvable = template.with_shapes(moving)
     seen = observe(performances, None if known is None else known[:, moving])
     frame = _neutral_frame(solvable, seen, settings.neutral_frame)
     neutral = approximate_neutral(solvable, seen.points[frame], seen.confidence[frame])
@@ -267,11 +267,6 @@ def _rigid(template: Template, settings: RigSettings) -> bool:
             f'{template.rigid_vertices.size}; add them to the template, or use head = "all"'
         )
     return settings.head == "rigid"
-
-
-def _with_shapes(template: Template, kept: Bools) -> Template:
-    names = tuple(name for name, keep in zip(template.names, kept, strict=True) if keep)
-    return replace(template, deltas=template.deltas[kept], names=names)
 
 
 def _whole_deltas(template: Template, moving: Bools, some: Floats) -> Floats:

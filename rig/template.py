@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -82,6 +82,11 @@ class Template:
         """(B,) whether each shape moves any vertex by more than `ZERO_SHAPE_MM`."""
         moving: Bools = self.extents_mm > ZERO_SHAPE_MM
         return moving
+
+    def with_shapes(self, kept: Bools) -> Template:
+        """The same template with the shapes `kept` (B,) alone."""
+        names = tuple(name for name, keep in zip(self.names, kept, strict=True) if keep)
+        return replace(self, deltas=self.deltas[kept], names=names)
 
     def support(self, tolerance: float) -> Bools:
         """Where each shape acts: (B, V), displacement above `tolerance` of the shape's extent.

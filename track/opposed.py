@@ -178,18 +178,20 @@ def _beside(opening: Opening, vertices: Floats, graph: sparse.csr_matrix) -> Int
     """Which side (V,) of an opening each vertex is on: 1, -1, or 0 for neither."""
     ends = vertices[opening.corners]
     reach = _REACH * float(np.linalg.norm(ends[0] - ends[1]))
-    return _nearer((opening.first, opening.second), reach, graph)
+    return nearer_seeds((opening.first, opening.second), reach, graph)
 
 
-def _nearer(seeds: tuple[Ints, Ints], reach: float, graph: sparse.csr_matrix) -> Ints:
+def nearer_seeds(
+    seeds: tuple[Ints, Ints], reach_mm: float, graph: sparse.csr_array | sparse.csr_matrix
+) -> Ints:
     """1 and -1 where the first or the second seeds are nearer along the mesh, within reach."""
-    far = [
-        csgraph.dijkstra(graph, indices=seed, min_only=True, limit=reach + 2.0 * _BETWEEN_MM)
-        for seed in seeds
-    ]
     label = np.zeros(graph.shape[0], dtype=np.int64)
-    label[(far[0] < reach) & (far[0] < far[1] - _BETWEEN_MM)] = 1
-    label[(far[1] < reach) & (far[1] < far[0] - _BETWEEN_MM)] = -1
+    if min(map(len, seeds)) == 0:
+        return label
+    limit = reach_mm + 2.0 * _BETWEEN_MM
+    one, two = (csgraph.dijkstra(graph, indices=seed, min_only=True, limit=limit) for seed in seeds)
+    label[(one < reach_mm) & (one < two - _BETWEEN_MM)] = 1
+    label[(two < reach_mm) & (two < one - _BETWEEN_MM)] = -1
     return label
 
 
@@ -215,7 +217,7 @@ def _touching(
             continue
         sign = _two_sides(opposite[inside][:, inside], beside[inside][:, inside])
         seeds = used[inside[sign > 0]], used[inside[sign < 0]]
-        out.append(_nearer(seeds, _TOUCHING_MM, graph))
+        out.append(nearer_seeds(seeds, _TOUCHING_MM, graph))
     return out
 
 

@@ -28,7 +28,7 @@ test-landmarks: setup ## the 68-point detector on the simulated actor; read docs
 
 bench: setup ## every benchmark; those on real takes want the folder SHARED
 	$(PYTHON) -m tools.bench.bench_actor
-	$(PYTHON) -m tools.bench.bench_calibrate --seeds 1
+	$(PYTHON) -m tools.bench.bench_calibrate protocol opponents images --small --seeds 2
 	$(PYTHON) -m tools.bench.bench_mcap
 	$(PYTHON) -m tools.bench.rig speed --shared $(SHARED)
 	$(PYTHON) -m tools.bench.bench_neutral

@@ -2,25 +2,42 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
-from capture.arrays import Bools, Floats, check_shape
+from capture.arrays import Bools, Floats
 from capture.errors import SettingsError, SolveError, TakeError, raise_all
 from capture.progress import Progress, silent
 from capture.settings import check_ranges
-from recon.array_covariance import focal_sigma
+from recon.array_covariance import ArrayCovariance, array_covariance
+from recon.array_faults import odd_devices
+from recon.array_gauge import regauged
+from recon.array_geometry import ball_points
 from recon.array_state import ArrayState
-from recon.array_world import IMAGE_UP, ArrayWorld, array_world
-from recon.board_chain import initial_state
-from recon.colmap import Adjustment, AdjustOptions, adjust_array, held_corners
+from recon.array_suspects import explain_suspects
+from recon.array_world import BOARD_STANDS, IMAGE_UP, ArrayWorld, array_world
+from recon.board_chain import first_guess
+from recon.board_shape import BoardShape
+from recon.colmap import Adjustment, AdjustOptions, adjust_array
+from recon.held_out import HeldOut, held_out
+from recon.nominal_lenses import nominal_lenses
 from recon.observations import BoardObservations
+from recon.split_half import SplitHalf, split_half
+from recon.view_check import check_upright, check_views
 
 _NORMAL_MAD = 1.4826  # standard deviation over median absolute deviation, for normal noise
 _LEAST_SIGMA_PX = 0.01  # noise-free corners must not all become outliers
-_HELD_PHASE = 3  # the held-out poses are every k-th, from this one
+_POOR = 0.5  # a view of which fewer corners fit the rest is bad
+_BAD_VIEWS, _BAD_SHARE = 2, 0.1  # a device with so many of them is looked into
+_ODD = 3.0  # so is one whose residual is this many times the median of the devices
+_ODD_PX = 1.0  # unless it is below this
+_MOST_ODD = 4  # devices that are left out one after the other
 _STAGES = 6
+_APART = "devices do not fit the others"
+
+Adjuster = Callable[[ArrayState, BoardObservations], ArrayState]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,9 +54,16 @@ class CalibrateSettings:
         least_poses: a take with fewer board poses is refused.
         loss_px: scale of the Cauchy loss.
         outlier_sigmas: corners further off than this many robust standard deviations are dropped.
-        free_board: whether the board's shape is solved for as well, three corners held.
+        free_board: whether the board's shape is solved for as well; its size stays nominal.
         held_out: fraction of the poses left out of a second solve to check the first.
+        halves: whether two halves of the poses are solved apart and compared.
+        volume_mm: radius of the face volume, a ball about the world's origin.
         image_up: the side of the images that is up: "top", "bottom", "left", "right".
+        world_frame: the frame in which the board itself stands where the world is to be; None
+            takes the world from the array.
+        world_board: how it stands there: "upright" on a stand, facing the array, or "lying".
+        bar_tolerance: a scale bar further off its length than this fraction refuses the board file.
+        leave_out: devices that are not to be calibrated.
     """
 
     focal_guess: float | None = None
@@ -53,14 +77,20 @@ class CalibrateSettings:
     outlier_sigmas: float = 4.0
     free_board: bool = True
     held_out: float = 0.15
+    halves: bool = True
+    volume_mm: float = 120.0
     image_up: str = "top"
+    world_frame: int | None = None
+    world_board: str = "upright"
+    bar_tolerance: float = 1e-3
+    leave_out: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         check_ranges(
             "calibrate", self, min_corners=(4, 1000), max_blur_px=(0.5, 100.0),
             still_px=(0.0, 100.0), max_poses=(3, 10000), least_views=(2, 10000),
             least_poses=(3, 10000), loss_px=(0.01, 100.0), outlier_sigmas=(2.0, 100.0),
-            held_out=(0.0, 0.5),
+            held_out=(0.0, 0.5), volume_mm=(1.0, 10000.0), bar_tolerance=(0.0, 1.0),
         )  # fmt: skip
         problems: list[str] = []
         if self.focal_guess is not None and not 0.2 <= self.focal_guess <= 50.0:
@@ -70,29 +100,11 @@ class CalibrateSettings:
             )
         if self.image_up not in IMAGE_UP:
             problems.append(f"image_up: one of {', '.join(IMAGE_UP)}, found {self.image_up!r}")
+        if self.world_board not in BOARD_STANDS:
+            problems.append(
+                f"world_board: one of {', '.join(BOARD_STANDS)}, found {self.world_board!r}"
+            )
         raise_all("calibrate settings", problems, SettingsError)
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class HeldOut:
-    """How poses that a solve has not seen fit it, only their board pose being refitted.
-
-    Attributes:
-        poses: indices of the poses left out; empty when the check was not made.
-        training_px: per-coordinate rms of the poses that were solved for.
-        held_out_px: per-coordinate rms of those left out.
-        remark: why the check was not made, or "".
-    """
-
-    poses: tuple[int, ...]
-    training_px: float
-    held_out_px: float
-    remark: str = ""
-
-    @property
-    def ratio(self) -> float:
-        """Held-out over training rms; NaN when the check was not made."""
-        return self.held_out_px / self.training_px if self.poses else float("nan")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -105,7 +117,10 @@ class ArraySolution:
         kept: (M,) which of them the final solve used.
         residuals: (M, 2) predicted minus observed, px; NaN behind a camera.
         sigma_px: robust standard deviation of a residual, per coordinate.
-        focal_sigma: (C, 2) standard deviations of fx and fy, px; NaN when not determined.
+        shape: the nominal board.
+        limit_px: (M,) the size of residual beyond which a sighting was dropped.
+        covariance: of lenses, places and board shape; None when they are not determined.
+        split_half: how two solves from disjoint halves of the poses differ.
         held_out: the check with poses left out.
         world: how the world was chosen.
         converged: whether the last adjustment met its stopping rule.
@@ -116,17 +131,28 @@ class ArraySolution:
     kept: Bools
     residuals: Floats
     sigma_px: float
-    focal_sigma: Floats
+    shape: BoardShape
+    limit_px: Floats
+    covariance: ArrayCovariance | None
     held_out: HeldOut
+    split_half: SplitHalf
     world: ArrayWorld
     converged: bool
+
+    @property
+    def focal_sigma(self) -> Floats:
+        """Standard deviations (C, 2) of fx and fy, px; NaN when not determined."""
+        if self.covariance is None:
+            return np.full((len(self.state.cameras), 2), np.nan)
+        return self.covariance.lens_sigma[:, :2]
 
 
 def solve_array(
     observations: BoardObservations,
-    corners: Floats,
+    shape: BoardShape | Floats,
     settings: CalibrateSettings,
     *,
+    every: BoardObservations | None = None,
     progress: Progress = silent,
 ) -> ArraySolution:
     """Calibrate lenses and places of an array from sightings of a moving board.
@@ -136,94 +162,135 @@ def solve_array(
 
     Args:
         observations: corner sightings.
-        corners: (N, 3) nominal corners of the board, board space, mm, flat at Z = 0.
+        shape: the nominal board; corners (N, 3), mm, at Z = 0 stand for one flat board.
         settings: of the stage.
+        every: sightings of all frames, to tell by how many frames a device is late; the
+            observations themselves when None.
         progress: told after each step.
 
     Raises:
-        TakeError: naming every device that saw too little of the board.
+        TakeError: naming every device that saw too little of the board, whose images are mirrored,
+            that is out of step, moved or exchanged with another.
         SolveError: when the devices do not hang together, or the solve fails.
     """
-    check_shape(corners=(corners, "N 3"))
-    check_views(observations, settings)
+    shape = shape if isinstance(shape, BoardShape) else BoardShape.flat_board(shape)
+    every = observations if every is None else every
+    check_views(observations, settings.least_poses, settings.least_views)
+    check_upright(observations, shape)
     progress(0, _STAGES, "array")
-    state = initial_state(observations, corners, settings.focal_guess)
-    rough = _typical(state.residuals(observations))
+    guess = first_guess(observations, shape, settings.focal_guess)
+    odd = odd_devices(guess.links)
+    if odd:
+        _look_into(odd, observations, every, shape, settings)
     progress(1, _STAGES, "array")
+    found, kept = _settled(guess.state, observations, shape, settings, progress)
+    kept, limit, sigma = _inliers(found.state, observations, settings.outlier_sigmas)
+    poor = [c for c in _poor_devices(found.state, observations, kept) if c not in odd]
+    if poor:
+        _look_into(poor[:1], observations, every, shape, settings)
+    used = observations.select(kept)
+    middle = shape.corners.mean(axis=0)[None]
+    places = np.concatenate([pose.apply(middle) for pose in found.state.array_from_board])
+    world = array_world(found.state.cameras, places, settings.image_up)
+    final = found.state.moved(world.world_from_array)
+    adjust, refit = _adjusters(shape, settings)
+    check = held_out(final, used, adjust, refit, settings.held_out, settings.least_views)
+    progress(5, _STAGES, "array")
+    halves = SplitHalf(remark="switched off")
+    if settings.halves:
+        volume = ball_points(np.zeros(3), settings.volume_mm)
+        halves = split_half(final, used, adjust, volume, settings.least_views)
+    covariance = array_covariance(final, used, shape if settings.free_board else None, sigma)
+    progress(_STAGES, _STAGES, "array")
+    return ArraySolution(
+        state=final, observations=observations, kept=kept, residuals=final.residuals(observations),
+        sigma_px=sigma, shape=shape, limit_px=limit, covariance=covariance, held_out=check,
+        split_half=halves, world=world, converged=found.converged,
+    )  # fmt: skip
+
+
+def _settled(
+    state: ArrayState,
+    observations: BoardObservations,
+    shape: BoardShape,
+    settings: CalibrateSettings,
+    progress: Progress = silent,
+) -> tuple[Adjustment, Bools]:
+    """From a first guess to the adjusted array, and the sightings it used."""
+    rough = _typical(state.residuals(observations))
     if not np.isfinite(rough):
         raise SolveError("no start was found that puts the board before the devices that saw it")
     wide = AdjustOptions(loss_px=max(settings.loss_px, _NORMAL_MAD * rough))
     state = adjust_array(state, observations, wide).state
     progress(2, _STAGES, "array")
-    kept, _ = _inliers(state, observations, settings.outlier_sigmas)
     options = AdjustOptions(loss_px=settings.loss_px, free_board=settings.free_board)
-    found = _adjust(state, observations, kept, options, corners)
-    progress(3, _STAGES, "array")
-    kept, _ = _inliers(found.state, observations, settings.outlier_sigmas)
-    found = _adjust(found.state, observations, kept, options, corners)
-    progress(4, _STAGES, "array")
-    kept, sigma = _inliers(found.state, observations, settings.outlier_sigmas)
-    used = observations.select(kept)
-    check = _held_out(found.state, used, settings, options)
-    progress(5, _STAGES, "array")
-    held = held_corners(used, corners) if settings.free_board else None
-    spread = focal_sigma(found.state, used, held, sigma)
-    middle = corners.mean(axis=0)[None]
-    places = np.concatenate([pose.apply(middle) for pose in found.state.array_from_board])
-    world = array_world(found.state.cameras, places, settings.image_up)
-    final = found.state.moved(world.world_from_array)
-    progress(_STAGES, _STAGES, "array")
-    return ArraySolution(
-        state=final, observations=observations, kept=kept, residuals=final.residuals(observations),
-        sigma_px=sigma, focal_sigma=spread, held_out=check, world=world, converged=found.converged,
-    )  # fmt: skip
+    for step in (3, 4):
+        kept, _, _ = _inliers(state, observations, settings.outlier_sigmas)
+        found = _adjust(state, observations.select(kept), options, shape)
+        state = found.state
+        progress(step, _STAGES, "array")
+    return found, kept
 
 
-def check_views(
+def _look_into(
+    odd: list[int],
     observations: BoardObservations,
+    every: BoardObservations,
+    shape: BoardShape,
     settings: CalibrateSettings,
-    tally: dict[str, dict[str, int]] | None = None,
 ) -> None:
-    """Refuse a take in which a device, or all of them, saw too little of the board.
-
-    Args:
-        observations: usable corner sightings.
-        settings: of the stage.
-        tally: by device, frames used and refused by reason, for the message.
+    """Solve the devices that agree alone, and say what is wrong with the others.
 
     Raises:
-        TakeError: naming every such device with its counts.
+        TakeError: naming every one of them that does not fit the others.
     """
-    poses = len(np.unique(observations.pose))
-    views = (observations.view_counts() > 0).sum(axis=1)
-    problems = []
-    if poses < settings.least_poses:
-        problems.append(
-            f"the board was used at {poses} poses of {len(observations.frames)}; "
-            f"at least {settings.least_poses} are needed, 15 to 40 are good"
-        )
-    for name, count in zip(observations.device_names, views.tolist(), strict=True):
-        if count < settings.least_views:
-            reasons = (tally or {}).get(name, {})
-            told = ", ".join(f"{number} {reason}" for reason, number in reasons.items() if number)
-            corners = int((observations.device == observations.device_names.index(name)).sum())
-            problems.append(
-                f"{name}: used the board in {count} frames with {corners} corners"
-                + (f" ({told})" if told else "")
-                + f"; at least {settings.least_views} are needed: hold the board before this device"
-            )
-    raise_all("devices saw too little of the board", problems, TakeError)
+    odd = list(odd)
+    for _ in range(_MOST_ODD):
+        fine = [c for c in range(len(observations.device_names)) if c not in odd]
+        healthy = observations.of_devices(fine)
+        guess = first_guess(healthy, shape, settings.focal_guess)
+        found, _ = _settled(guess.state, healthy, shape, settings)
+        kept, _, sigma = _inliers(found.state, healthy, settings.outlier_sigmas)
+        poor = _poor_devices(found.state, healthy, kept)
+        if not poor or 2 * len(odd) >= len(fine):
+            break
+        odd.append(fine[poor[0]])
+    lenses = nominal_lenses(observations, shape, settings.focal_guess)
+    said = explain_suspects(found.state, lenses, every, sigma, shape)
+    raise_all(_APART, list(dict.fromkeys(said.values())), TakeError)
+
+
+def _poor_devices(state: ArrayState, observations: BoardObservations, kept: Bools) -> list[int]:
+    """Devices some of whose views do not fit, or far worse than the others', worst first."""
+    residuals = state.residuals(observations)
+    rows = [observations.device == c for c in range(len(observations.device_names))]
+    sizes = np.array([_typical(residuals[own]) for own in rows])
+    bad, views = np.zeros((2, len(rows)))
+    for device, _, own in observations.views():
+        views[device] += 1
+        bad[device] += kept[own].mean() < _POOR
+    odd = sizes > max(_ODD * float(np.median(sizes)), _ODD_PX)
+    poor = np.flatnonzero(odd | (bad >= np.maximum(_BAD_VIEWS, _BAD_SHARE * views)))
+    if 2 * len(poor) >= len(rows):
+        return []
+    worst: list[int] = poor[np.argsort(-(bad / views + odd)[poor], kind="stable")].tolist()
+    return worst
+
+
+def _adjusters(shape: BoardShape, settings: CalibrateSettings) -> tuple[Adjuster, Adjuster]:
+    """How to solve everything, and board poses alone, from a start and sightings."""
+    options = AdjustOptions(loss_px=settings.loss_px, free_board=settings.free_board)
+    fixed = AdjustOptions(loss_px=settings.loss_px, free_lenses=False, free_cameras=False)
+    return (
+        lambda start, seen: _adjust(start, seen, options, shape).state,
+        lambda start, seen: adjust_array(start, seen, fixed).state,
+    )
 
 
 def _adjust(
-    state: ArrayState,
-    observations: BoardObservations,
-    kept: Bools,
-    options: AdjustOptions,
-    corners: Floats,
+    state: ArrayState, used: BoardObservations, options: AdjustOptions, shape: BoardShape
 ) -> Adjustment:
-    """Adjust on the kept sightings; scale then rests on all corners, not only on the held ones."""
-    used = observations.select(kept)
+    """Adjust on these sightings; the board keeps its nominal size and place."""
     counts = (used.view_counts() > 0).sum(axis=1)
     lost = [name for name, n in zip(used.device_names, counts, strict=True) if n < 2]
     if lost:
@@ -232,32 +299,15 @@ def _adjust(
             "were all devices triggered together, and is the board file that of this board?"
         )
     found = adjust_array(state, used, options)
-    factor = board_scale(found.state.corners, corners, np.unique(used.corner))
-    return Adjustment(found.state.scaled(factor), found.converged)
-
-
-def board_scale(
-    found: Floats, nominal: Floats, seen: np.ndarray[tuple[int], np.dtype[np.int64]]
-) -> float:
-    """The factor that brings the found board shape (N, 3) to the size of the nominal one (N, 3).
-
-    Args:
-        found: solved corners, mm.
-        nominal: corners as measured with a ruler, mm.
-        seen: ids of the corners that were solved for.
-
-    References:
-        Horn 1987, symmetric scale: the ratio of the root mean square distances from the centroids.
-    """
-    check_shape(found=(found, "N 3"), nominal=(nominal, "N 3"))
-    spread = [np.sqrt(((x[seen] - x[seen].mean(axis=0)) ** 2).sum()) for x in (nominal, found)]
-    return float(spread[0] / spread[1])
+    if not options.free_board:
+        return found
+    return Adjustment(regauged(found.state, shape, np.unique(used.corner)), found.converged)
 
 
 def _inliers(
     state: ArrayState, observations: BoardObservations, sigmas: float
-) -> tuple[Bools, float]:
-    """Which residuals lie within the robust limit of their device, and the sigma of the array."""
+) -> tuple[Bools, Floats, float]:
+    """Which residuals lie within the robust limit of their device, the limits, and the sigma."""
     residuals = state.residuals(observations)
     size = np.linalg.norm(residuals, axis=1)
     whole = _NORMAL_MAD * _typical(residuals)
@@ -266,40 +316,10 @@ def _inliers(
         rows = observations.device == device
         own = _NORMAL_MAD * _typical(residuals[rows])
         limit[rows] = sigmas * max(min(own, 3.0 * whole), _LEAST_SIGMA_PX)
-    return size <= limit, whole
+    return size <= limit, limit, whole
 
 
 def _typical(residuals: Floats) -> float:
     """Median size of a coordinate, px; infinity when every corner fell behind its camera."""
     finite = np.abs(residuals[np.isfinite(residuals)])
     return float(np.median(finite)) if len(finite) else float("inf")
-
-
-def _held_out(
-    state: ArrayState, used: BoardObservations, settings: CalibrateSettings, options: AdjustOptions
-) -> HeldOut:
-    """Solve again without every k-th pose, from the answer, and refit only those poses to it."""
-    none = float("nan")
-    if settings.held_out == 0:
-        return HeldOut(poses=(), training_px=none, held_out_px=none, remark="switched off")
-    step = max(2, round(1.0 / settings.held_out))
-    poses = np.unique(used.pose)
-    left = poses[min(_HELD_PHASE, step - 1) :: step]
-    out = np.isin(used.pose, left)
-    training, test = used.select(~out), used.select(out)
-    if len(left) == 0 or ((training.view_counts() > 0).sum(axis=1) < settings.least_views).any():
-        return HeldOut(
-            poses=(), training_px=none, held_out_px=none, remark="too few poses to leave any out"
-        )
-    found = adjust_array(state, training, options).state
-    fixed = AdjustOptions(loss_px=settings.loss_px, free_lenses=False, free_cameras=False)
-    refit = adjust_array(found, test, fixed).state
-    return HeldOut(
-        poses=tuple(left.tolist()),
-        training_px=_rms(found.residuals(training)),
-        held_out_px=_rms(refit.residuals(test)),
-    )
-
-
-def _rms(residuals: Floats) -> float:
-    return float(np.sqrt(np.nanmean(residuals**2)))

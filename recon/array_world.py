@@ -1,4 +1,4 @@
-"""The world of a calibrated array, when no board pose was named to fix it."""
+"""The world of a calibrated array: from a named board pose, or from the array itself."""
 
 from __future__ import annotations
 
@@ -8,13 +8,19 @@ import numpy as np
 
 from capture.arrays import Floats, check_shape
 from capture.camera import CameraArray
+from capture.errors import SettingsError
 from capture.pose import Pose
+from recon.board_shape import BoardShape
 
 IMAGE_UP: dict[str, tuple[float, float, float]] = {
     "top": (0.0, -1.0, 0.0),
     "bottom": (0.0, 1.0, 0.0),
     "left": (-1.0, 0.0, 0.0),
     "right": (1.0, 0.0, 0.0),
+}
+BOARD_STANDS: dict[str, tuple[tuple[int, int, int], ...]] = {  # world axes in those of the board
+    "upright": ((1, 0, 0), (0, -1, 0), (0, 0, -1)),
+    "lying": ((1, 0, 0), (0, 0, -1), (0, 1, 0)),
 }
 _CONVERGING = (
     0.02  # least eigenvalue of the mean projector across the axes: about 8 degrees of spread
@@ -68,6 +74,37 @@ def array_world(cameras: CameraArray, board_centres: Floats, image_up: str = "to
     up /= max(float(np.linalg.norm(up)), 1e-12)
     rotation = np.stack([np.cross(up, front), up, front])
     return ArrayWorld(Pose(rotation, -rotation @ origin), words, up_words)
+
+
+def world_from_board_pose(
+    array_from_board: Pose, shape: BoardShape, how: str = "upright"
+) -> ArrayWorld:
+    """The world that one pose of the board names, its origin in the middle of the corners.
+
+    The board's own axes are those of its print: +X to the right, +Y down, +Z into it.
+
+    Args:
+        array_from_board: the board at that pose, mm.
+        shape: its corners; boards whose place on the body is unknown do not count.
+        how: "upright", the board on a stand, facing the array: world +X along board +X, +Y
+            against board +Y, +Z out of its front. "lying", the board flat on a table: +Y out of
+            its front, +X along board +X, +Z along board +Y.
+
+    Raises:
+        SettingsError: for any other word.
+    """
+    if how not in BOARD_STANDS:
+        raise SettingsError(
+            f"how the board stands: found {how!r}, expected one of {', '.join(BOARD_STANDS)}"
+        )
+    rotation = np.array(BOARD_STANDS[how], dtype=np.float64)
+    placed = shape.placed[shape.face]
+    middle = shape.corners[placed if placed.any() else slice(None)].mean(axis=0)
+    world_from_board = Pose(rotation, -rotation @ middle)
+    words = f"middle of the {how} board"
+    return ArrayWorld(
+        world_from_board @ array_from_board.inverse(), words, f"axes of the {how} board"
+    )
 
 
 def _origin(centres: Floats, axes: Floats, board_centres: Floats) -> tuple[Floats, str]:

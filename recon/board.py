@@ -10,6 +10,7 @@
     marker_mm = 15.0
     dictionary = "DICT_5X5_1000"
     legacy = false            # the pattern of OpenCV before 4.6
+    first_id = 0              # id of the first marker: the boards of one body share none
 
 Board space: origin at the outer corner of square (0, 0), +X along the squares of a row, +Y along
 the columns, +Z into the board, so that a board seen upright from the front agrees with OpenCV's
@@ -18,12 +19,10 @@ camera axes.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -31,10 +30,10 @@ import numpy as np
 from capture.arrays import Floats
 from capture.documents import read_toml
 from capture.errors import SettingsError, raise_all
-from capture.names import known_hint
+from recon.board_table import field_values, print_problems, sizes_mm, unknown
+from recon.marker_dictionary import cut_dictionary, dictionary_problems
 
 _LEAST_SQUARES = 3
-_DICTIONARY = "DICT_"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,6 +48,7 @@ class Board:
         marker_mm: measured side of a marker, black border included.
         dictionary: name of the marker dictionary in cv2.aruco.
         legacy: whether the pattern is that of OpenCV before 4.6 (and of some board printers).
+        first_id: id of the first marker in the dictionary; the others follow it.
     """
 
     squares_x: int
@@ -58,11 +58,14 @@ class Board:
     dictionary: str
     kind: str = "charuco"
     legacy: bool = False
+    first_id: int = 0
 
     def __post_init__(self) -> None:
         problems: list[str] = []
         if self.kind != "charuco":
             problems.append(f'kind: only "charuco" is known, found {self.kind!r}')
+        if self.first_id < 0:
+            problems.append(f"first_id: at least 0, found {self.first_id}")
         for key in ("squares_x", "squares_y"):
             if getattr(self, key) < _LEAST_SQUARES:
                 problems.append(f"{key}: at least {_LEAST_SQUARES}, found {getattr(self, key)}")
@@ -75,8 +78,25 @@ class Board:
                 f"marker_mm: a marker lies inside its square, so it must be below "
                 f"square_mm = {self.square_mm}, found {self.marker_mm}"
             )
-        problems += self._dictionary_problems()
+        if self.first_id >= 0:
+            what = f"{self.squares_x} x {self.squares_y} squares"
+            problems += dictionary_problems(self.dictionary, self.marker_ids, what)
         raise_all("board", problems, SettingsError)
+
+    @property
+    def marker_ids(self) -> range:
+        """Ids of the markers in their dictionary."""
+        return range(self.first_id, self.first_id + self.squares_x * self.squares_y // 2)
+
+    @property
+    def pitch_mm(self) -> float:
+        """Distance of neighbouring corners."""
+        return self.square_mm
+
+    @property
+    def size_mm(self) -> tuple[float, float]:
+        """Width and height of the printed pattern."""
+        return self.squares_x * self.square_mm, self.squares_y * self.square_mm
 
     @property
     def corner_count(self) -> int:
@@ -94,39 +114,23 @@ class Board:
         return scaled
 
     def pattern(self) -> cv2.aruco.CharucoBoard:
-        """OpenCV's object for this board: detects it, draws it."""
-        whole = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
-        need = self.squares_x * self.squares_y // 2
-        # Comparing with this board's markers alone makes detection ten times faster.
-        dictionary = cv2.aruco.Dictionary(
-            whole.bytesList[:need], whole.markerSize, whole.maxCorrectionBits
-        )
+        """OpenCV's object for this board: detects it, draws it.
+
+        Its markers are counted from 0, whatever `first_id` is.
+        """
+        dictionary = cut_dictionary(self.dictionary, self.marker_ids)
         board = cv2.aruco.CharucoBoard(
             (self.squares_x, self.squares_y), self.square_mm, self.marker_mm, dictionary
         )
         board.setLegacyPattern(self.legacy)
         return board
 
-    def _dictionary_problems(self) -> list[str]:
-        known = _dictionaries()
-        if self.dictionary not in known:
-            hint = known_hint(self.dictionary.upper(), known)
-            return [f"dictionary: no marker dictionary is called {self.dictionary!r}; {hint}"]
-        have = len(cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary)).bytesList)
-        need = self.squares_x * self.squares_y // 2
-        if need > have:
-            return [
-                f"dictionary: {self.squares_x} x {self.squares_y} squares need {need} markers, "
-                f"{self.dictionary} has {have}; take a larger dictionary"
-            ]
-        return []
-
 
 def read_board(path: Path) -> Board:
-    """Read a board file.
+    """Read the file of one ChArUco board; `recon.board_body.read_body` reads every kind.
 
     Args:
-        path: a TOML file with one table, `[board]`.
+        path: a TOML file with one table, `[board]`, and perhaps `[print]`.
 
     Raises:
         SettingsError: naming the file and every key that is missing, unknown or out of range.
@@ -136,47 +140,18 @@ def read_board(path: Path) -> Board:
         "squares_y, square_mm, marker_mm, dictionary"
     )
     document = read_toml(path, SettingsError, absent=absent)
-    raise_all(str(path), _unknown(document, ("board",), "table"), SettingsError)
+    raise_all(str(path), unknown(document, ("board", "print"), "table"), SettingsError)
     table = document.get("board")
     if not isinstance(table, Mapping):
         raise SettingsError(
             f"{path}: expected a table [board], found {sorted(document) or 'nothing'}"
         )
-    fields = dataclasses.fields(Board)
-    problems = _unknown(table, tuple(field.name for field in fields), "key")
-    values: dict[str, Any] = {}
-    for field in fields:
-        if field.name in table:
-            try:
-                values[field.name] = _typed(field.name, str(field.type), table[field.name])
-            except SettingsError as error:
-                problems.append(str(error))
-        elif field.default is dataclasses.MISSING:
-            problems.append(f"missing key {field.name!r}")
+    values, problems = field_values(Board, table)
     raise_all(f"{path}: [board]", problems, SettingsError)
     try:
-        return Board(**values)
+        board = Board(**values)
     except SettingsError as error:
         raise SettingsError(f"{path}: {error}") from error
-
-
-def _typed(name: str, kind: str, value: Any) -> Any:
-    wanted: dict[str, tuple[type, ...]] = {
-        "int": (int,),
-        "float": (int, float),
-        "str": (str,),
-        "bool": (bool,),
-    }
-    if not isinstance(value, wanted[kind]) or (kind != "bool" and isinstance(value, bool)):
-        raise SettingsError(f"{name}: expected {kind}, found {value!r}")
-    return float(str(value)) if kind == "float" else value
-
-
-def _unknown(found: Mapping[str, Any], known: tuple[str, ...], what: str) -> list[str]:
-    return [
-        f"unknown {what} {key!r}; {known_hint(key, known)}" for key in found if key not in known
-    ]
-
-
-def _dictionaries() -> list[str]:
-    return sorted(name for name in dir(cv2.aruco) if name.startswith(_DICTIONARY))
+    if "print" in document:
+        raise_all(str(path), print_problems(sizes_mm(board), document["print"]), SettingsError)
+    return board

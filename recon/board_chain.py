@@ -2,32 +2,29 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
-from capture.arrays import Floats, Ints
+from capture.arrays import Bools, Floats, Ints
 from capture.camera import Camera, CameraArray
 from capture.errors import SolveError
 from capture.pose import Pose
+from recon.array_geometry import rigid_fit
 from recon.array_state import ArrayState
+from recon.board_shape import BoardShape
+from recon.nominal_lenses import LEAST_CORNERS, face_rows, nominal_lenses
 from recon.observations import BoardObservations
 
-_FOCAL_RANGE = (0.3, 30.0)  # focal length over image size that a device can have
-_ROUGH_FIT_PX = 3.0  # rms of a plausible one-device fit, at 640 px of image
-_REFERENCE_PX = 640.0
-_MOST_VIEWS = 12  # views of one device that its own rough fit uses
+_AGREEING = 0.05  # relative poses nearer than this (radians plus fraction of distance) agree
 _CAP = 0.1  # a relative pose off by more than this (radians, or fraction of distance) is just wrong
-_ONE_DEVICE_FLAGS = (
-    cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_PRINCIPAL_POINT | cv2.CALIB_FIX_ASPECT_RATIO
-    | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3
-)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
 class _View:
-    """One device's sight of one board pose: the one or two poses IPPE offers, best first."""
+    """One device's sight of the board at one pose: the poses IPPE offers, best first, by face."""
 
     device: int
     pose: int
@@ -35,14 +32,58 @@ class _View:
     corners: int
 
 
+@dataclass(frozen=True, eq=False)
+class Links:
+    """How well the devices agree, two by two, on where the others stand.
+
+    Attributes:
+        child_from_parent: the relative pose that most shared board poses agree with, by pair.
+        shared: (C, C) board poses both saw.
+        agreeing: (C, C) how many of them agree with that relative pose.
+        weight: (C, C) corners shared at board poses that agree.
+    """
+
+    child_from_parent: dict[tuple[int, int], Pose]
+    shared: Ints
+    agreeing: Ints
+    weight: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class FirstGuess:
+    """Where a bundle adjustment starts.
+
+    Attributes:
+        state: lenses, camera places, board poses, in the space of the best-connected device.
+        links: how well the devices agreed.
+    """
+
+    state: ArrayState
+    links: Links
+
+
 def initial_state(
-    observations: BoardObservations, corners: Floats, focal_guess: float | None = None
+    observations: BoardObservations,
+    shape: BoardShape | Floats,
+    focal_guess: float | None = None,
 ) -> ArrayState:
+    """The state of `first_guess`."""
+    return first_guess(observations, shape, focal_guess).state
+
+
+def first_guess(
+    observations: BoardObservations,
+    shape: BoardShape | Floats,
+    focal_guess: float | None = None,
+) -> FirstGuess:
     """Estimate lenses, camera places and board poses well enough to start a bundle adjustment.
+
+    Boards whose place on the body is not known are chained as if each were waved alone; their
+    places on the body are then the ones that most poses agree with.
 
     Args:
         observations: corner sightings.
-        corners: (N, 3) nominal board, board space, mm, flat at Z = 0.
+        shape: the nominal board; corners (N, 3), mm, at Z = 0 stand for one flat board.
         focal_guess: focal length over image width, or None to find it from the views.
 
     Returns:
@@ -55,162 +96,193 @@ def initial_state(
         Zhang 2000, section 3.1 (focal length from homographies); Collins and Bartoli 2014 (IPPE);
         OpenCV's multiview calibration tutorial (maximum spanning tree over pairs).
     """
-    lenses = nominal_lenses(observations, corners, focal_guess)
-    views = _pose_candidates(observations, corners, lenses)
-    by_place = {(view.device, view.pose): view for view in views}
-    parent, order = _spanning_tree(observations)
+    if not isinstance(shape, BoardShape):
+        shape = BoardShape.flat_board(shape)
+    lenses = nominal_lenses(observations, shape, focal_guess)
+    groups = _groups(shape)
+    apart, poses = _apart(observations, shape, groups)
+    views = _pose_candidates(apart, shape, lenses)
+    links = _link(apart, views)
+    parent, order = _spanning_tree(apart, links)
     camera_from_array = {order[0]: Pose.identity()}
     for child in order[1:]:
-        child_from_parent = _medoid_relative(
-            by_place, child, parent[child], len(observations.frames)
-        )
+        child_from_parent = links.child_from_parent[child, parent[child]]
         camera_from_array[child] = child_from_parent @ camera_from_array[parent[child]]
     cameras = CameraArray(
         tuple(lens.posed(camera_from_array[index]) for index, lens in enumerate(lenses))
     )
-    poses = _board_poses(observations, corners, cameras, views)
-    return ArrayState(cameras, poses, np.array(corners, dtype=np.float64))
+    found = _board_poses(apart, shape.corners, cameras, views)
+    state = _joined(observations, shape, groups, poses, ArrayState(cameras, found, shape.corners))
+    return FirstGuess(state, links)
 
 
-def nominal_lenses(
-    observations: BoardObservations, corners: Floats, focal_guess: float | None
-) -> list[Camera]:
-    """One rough lens a device: square pixels, centred, and k1 where the views show it.
-
-    Args:
-        observations: corner sightings.
-        corners: (N, 3) nominal board, mm.
-        focal_guess: focal length over image width for all devices, or None to find each.
-    """
-    sizes = np.array(observations.sizes, dtype=np.float64)
-    if focal_guess is not None:
-        return [_lens(observations, c, focal_guess * sizes[c, 0], 0.0) for c in range(len(sizes))]
-    longest = sizes.max(axis=1)
-    linear = (
-        np.array([_linear_focal(observations, corners, c) for c in range(len(sizes))]) / longest
-    )
-    pooled = float(np.nanmedian(linear)) if np.isfinite(linear).any() else 1.5
-    fits = [
-        _one_device_fit(observations, corners, c, (x if np.isfinite(x) else pooled) * longest[c])
-        for c, x in enumerate(linear)
-    ]
-    good = np.array([focal for focal, _ in fits]) / longest
-    pooled = float(np.nanmedian(good)) if np.isfinite(good).any() else pooled
-    return [
-        _lens(observations, c, focal if np.isfinite(focal) else pooled * longest[c], k1)
-        for c, (focal, k1) in enumerate(fits)
-    ]
+def _groups(shape: BoardShape) -> Ints:
+    """The group that each face moves with: one of all placed faces, one for each other face."""
+    first = 1 if shape.placed.any() else 0
+    return np.where(shape.placed, 0, first + np.cumsum(~shape.placed) - 1).astype(np.int64)
 
 
-def _lens(observations: BoardObservations, device: int, focal_px: float, k1: float) -> Camera:
-    width, height = observations.sizes[device]
-    return Camera(
-        name=observations.device_names[device], width=width, height=height, fx=float(focal_px),
-        fy=float(focal_px), cx=(width - 1) / 2, cy=(height - 1) / 2,
-        distortion=np.array([k1, 0.0, 0.0, 0.0, 0.0]), camera_from_world=Pose.identity(),
+def _apart(
+    observations: BoardObservations, shape: BoardShape, groups: Ints
+) -> tuple[BoardObservations, list[tuple[int, int]]]:
+    """The same sightings, each group of faces at a board pose of its own, and what these are."""
+    if groups.max() == 0:
+        return observations, [(pose, 0) for pose in range(len(observations.frames))]
+    group = groups[shape.face[observations.corner]]
+    keys = observations.pose * (groups.max() + 1) + group
+    found, pose = np.unique(keys, return_inverse=True)
+    poses = [divmod(int(key), int(groups.max()) + 1) for key in found]
+    frames = tuple(observations.frames[before] for before, _ in poses)
+    return dataclasses.replace(observations, frames=frames, pose=pose.astype(np.int64)), poses
+
+
+def _joined(
+    observations: BoardObservations,
+    shape: BoardShape,
+    groups: Ints,
+    poses: list[tuple[int, int]],
+    apart: ArrayState,
+) -> ArrayState:
+    """One body again: groups placed on it, and for each pose the motion they all like best."""
+    if groups.max() == 0:
+        return apart
+    found = dict(zip(poses, apart.array_from_board, strict=True))
+    count = int(groups.max()) + 1
+    together = np.array(
+        [[sum((p, g) in found and (p, h) in found for p in range(len(observations.frames)))
+          for g in range(count)] for h in range(count)]
     )  # fmt: skip
-
-
-def _device_views(observations: BoardObservations, device: int) -> list[slice]:
-    return [rows for c, _, rows in observations.views() if c == device]
-
-
-def _linear_focal(observations: BoardObservations, corners: Floats, device: int) -> float:
-    """Focal length, px, from the orthogonality of the homographies' columns; NaN if none shows it.
-
-    References:
-        Zhang 2000, equations 3 and 4, with square pixels and the principal point at the centre.
-    """
-    width, height = observations.sizes[device]
-    centre = np.array([(width - 1) / 2, (height - 1) / 2])
-    flat, tilt = [], []
-    for rows in _device_views(observations, device):
-        xy = corners[observations.corner[rows], :2]
-        found, _ = cv2.findHomography(xy, observations.pixels[rows] - centre, 0)
-        homography = np.asarray(found, dtype=np.float64)  # OpenCV's None becomes NaN
-        if not np.isfinite(homography).all():
-            continue
-        first, second = homography[:, 0], homography[:, 1]
-        scale = first[:2] @ first[:2] + second[:2] @ second[:2]
-        flat += [
-            first[:2] @ second[:2] / scale,
-            (first[:2] @ first[:2] - second[:2] @ second[:2]) / scale,
+    np.fill_diagonal(together, 0)
+    body_from_group = {0: Pose.identity()}
+    while len(body_from_group) < count:
+        inside = sorted(body_from_group)
+        outside = [g for g in range(count) if g not in body_from_group]
+        links = together[np.ix_(inside, outside)]
+        if links.max() <= 0:
+            raise SolveError(
+                f"{len(outside)} of {count} boards of the body were never seen together with the "
+                "others: turn the body so that two boards show, or give body_from_board in the file"
+            )
+        start, stop = divmod(int(np.argmax(links)), len(outside))
+        known, new = inside[start], outside[stop]
+        options = [
+            found[p, known].inverse() @ found[p, new]
+            for p in range(len(observations.frames))
+            if (p, known) in found and (p, new) in found
         ]
-        tilt += [first[2] * second[2] / scale, (first[2] ** 2 - second[2] ** 2) / scale]
-    a, b = np.array(flat), np.array(tilt)
-    inverse_square = -float(a @ b) / float(a @ a) if len(a) and a @ a > 0 else -1.0
-    focal = inverse_square**-0.5 if inverse_square > 0 else np.nan
-    low, high = (limit * max(width, height) for limit in _FOCAL_RANGE)
-    return float(focal) if low <= focal <= high else float("nan")
-
-
-def _one_device_fit(
-    observations: BoardObservations, corners: Floats, device: int, focal_px: float
-) -> tuple[float, float]:
-    """Focal length, px, and k1 of one device alone; NaN and 0 where its views do not tell."""
-    width, height = observations.sizes[device]
-    views = sorted(_device_views(observations, device), key=lambda s: s.start - s.stop)[
-        :_MOST_VIEWS
-    ]
-    objects = [corners[observations.corner[rows]].astype(np.float32) for rows in views]
-    pixels = [observations.pixels[rows].astype(np.float32) for rows in views]
-    matrix = np.array(
-        [[focal_px, 0, (width - 1) / 2], [0, focal_px, (height - 1) / 2], [0, 0, 1.0]]
-    )
-    try:
-        rms, found, bend, _, _ = cv2.calibrateCamera(
-            objects, pixels, (width, height), matrix, np.zeros(5), flags=_ONE_DEVICE_FLAGS
-        )
-    except cv2.error:  # degenerate views: the pooled focal length serves
-        return float("nan"), 0.0
-    focal, k1 = float(found[0, 0]), float(np.ravel(bend)[0])
-    size = max(width, height)
-    plausible = _FOCAL_RANGE[0] <= focal / size <= _FOCAL_RANGE[1] and abs(k1) < 2.0
-    if not plausible or rms > _ROUGH_FIT_PX * max(1.0, size / _REFERENCE_PX):
-        return float("nan"), 0.0
-    # OpenCV sums residuals in the order its threads finish: the last digits do not repeat.
-    return round(focal, 2), round(k1, 4)
+        body_from_group[new] = body_from_group[known] @ _medoid(options, np.arange(len(options)))[0]
+    corners = np.array(shape.corners)
+    for face, group in enumerate(groups.tolist()):
+        if not shape.placed[face]:
+            own = shape.face == face
+            corners[own] = body_from_group[group].apply(corners[own])
+    motions = []
+    for pose in range(len(observations.frames)):
+        rows = np.flatnonzero(observations.pose == pose)
+        options = [
+            found[pose, group] @ body_from_group[group].inverse()
+            for group in range(count)
+            if (pose, group) in found
+        ]
+        costs = [
+            _disagreement(observations, rows, apart.cameras, option.apply(corners))
+            for option in options
+        ]
+        motions.append(options[int(np.argmin(costs))] if options else Pose.identity())
+    return ArrayState(apart.cameras, tuple(motions), corners)
 
 
 def _pose_candidates(
-    observations: BoardObservations, corners: Floats, lenses: list[Camera]
+    observations: BoardObservations, shape: BoardShape, lenses: list[Camera]
 ) -> list[_View]:
+    body_from_face = [
+        rigid_fit(
+            np.concatenate([flat, np.zeros((len(flat), 1))], axis=1), shape.corners[shape.face == f]
+        )
+        for f in range(shape.face_count)
+        for flat in (shape.flat[shape.face == f],)
+    ]
     views = []
     for device, pose, rows in observations.views():
-        flat = lenses[device].undistort(observations.pixels[rows])
-        seen = np.isfinite(flat).all(axis=1)
-        if seen.sum() < 4:
-            continue
-        board = corners[observations.corner[rows]][seen]
-        middle = board.mean(axis=0)
-        found, turns, shifts, _ = cv2.solvePnPGeneric(
-            board - middle, flat[seen], np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
-        )
-        candidates = []
-        for turn, shift in zip(turns[:found], shifts[:found], strict=True):
-            if np.isfinite(turn).all() and np.isfinite(shift).all() and shift[2, 0] > 0:
-                moved = Pose.from_rotation_vector(
-                    turn[:, 0].astype(np.float64), shift[:, 0].astype(np.float64)
-                )
-                candidates.append(moved @ Pose(np.eye(3), -middle))
+        candidates: list[Pose] = []
+        for face, part in face_rows(observations, shape, rows):
+            ideal = lenses[device].undistort(observations.pixels[part])
+            seen = np.isfinite(ideal).all(axis=1)
+            if seen.sum() >= LEAST_CORNERS:
+                flat = shape.flat[observations.corner[part]][seen]
+                found = plane_poses(flat, ideal[seen])
+                candidates += [option @ body_from_face[face].inverse() for option in found]
         if candidates:
-            views.append(_View(device, pose, tuple(candidates), int(seen.sum())))
+            views.append(_View(device, pose, tuple(candidates), rows.stop - rows.start))
     return views
 
 
-def _spanning_tree(observations: BoardObservations) -> tuple[dict[int, int], list[int]]:
-    """Maximum spanning tree over devices by shared corners: parents, and root-first order."""
-    counts = observations.view_counts().astype(np.float64)
-    shared = np.array([[np.minimum(a, b).sum() for b in counts] for a in counts])
-    np.fill_diagonal(shared, 0.0)
-    root = int(np.argmax(shared.sum(axis=1)))
+def plane_poses(flat: Floats, ideal: Floats) -> list[Pose]:
+    """The one or two poses camera_from_board of a flat board, best first.
+
+    Args:
+        flat: (N, 2) corners on the board, mm.
+        ideal: (N, 2) the same in the image, normalised and without distortion.
+
+    References:
+        Collins and Bartoli 2014, Infinitesimal plane-based pose estimation.
+    """
+    board = np.concatenate([flat, np.zeros((len(flat), 1))], axis=1)
+    middle = board.mean(axis=0)
+    found, turns, shifts, _ = cv2.solvePnPGeneric(
+        board - middle, ideal, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
+    )
+    out = []
+    for turn, shift in zip(turns[:found], shifts[:found], strict=True):
+        if np.isfinite(turn).all() and np.isfinite(shift).all() and shift[2, 0] > 0:
+            moved = Pose.from_rotation_vector(
+                turn[:, 0].astype(np.float64), shift[:, 0].astype(np.float64)
+            )
+            out.append(moved @ Pose(np.eye(3), -middle))
+    return out
+
+
+def _link(observations: BoardObservations, views: list[_View]) -> Links:
+    """Compare the devices two by two on the board poses both saw."""
+    count = len(observations.device_names)
+    places: list[dict[int, _View]] = [{} for _ in range(count)]
+    for view in views:
+        places[view.device][view.pose] = view
+    relative: dict[tuple[int, int], Pose] = {}
+    shared, agreeing = np.zeros((2, count, count), dtype=np.int64)
+    weight = np.zeros((count, count))
+    for one in range(count):
+        for other in range(one):
+            both = sorted(places[one].keys() & places[other].keys())
+            options, owners = [], []
+            for place, pose in enumerate(both):
+                for first in places[one][pose].candidates:
+                    for second in places[other][pose].candidates:
+                        options.append(first @ second.inverse())
+                        owners.append(place)
+            if not options:
+                continue
+            best, near = _medoid(options, np.array(owners))
+            relative[one, other], relative[other, one] = best, best.inverse()
+            sizes = [min(places[one][p].corners, places[other][p].corners) for p in both]
+            shared[one, other] = shared[other, one] = len(both)
+            agreeing[one, other] = agreeing[other, one] = int(near.sum())
+            weight[one, other] = weight[other, one] = float(np.array(sizes)[near].sum())
+    return Links(relative, shared, agreeing, weight)
+
+
+def _spanning_tree(
+    observations: BoardObservations, links: Links
+) -> tuple[dict[int, int], list[int]]:
+    """Maximum spanning tree over devices by agreeing corners: parents, and root-first order."""
+    count = len(observations.device_names)
+    root = int(np.argmax(links.weight.sum(axis=1)))
     order, parent = [root], {}
-    while len(order) < len(counts):
-        outside = [c for c in range(len(counts)) if c not in order]
-        links = shared[np.ix_(order, outside)]
-        best = int(np.argmax(links))
-        start, stop = divmod(best, len(outside))
-        if links[start, stop] <= 0:
+    while len(order) < count:
+        outside = [c for c in range(count) if c not in order]
+        weight = links.weight[np.ix_(order, outside)]
+        start, stop = divmod(int(np.argmax(weight)), len(outside))
+        if weight[start, stop] <= 0:
             names = observations.device_names
             raise SolveError(
                 f"{', '.join(names[c] for c in outside)}: never saw the board together with "
@@ -221,23 +293,13 @@ def _spanning_tree(observations: BoardObservations) -> tuple[dict[int, int], lis
     return parent, order
 
 
-def _medoid_relative(
-    views: dict[tuple[int, int], _View], child: int, parent: int, poses: int
-) -> Pose:
-    """The relative pose child_from_parent that most shared board poses agree with."""
-    options: list[Pose] = []
-    owners: list[int] = []
-    for pose in range(poses):
-        if (child, pose) not in views or (parent, pose) not in views:
-            continue
-        for of_child in views[child, pose].candidates:
-            for of_parent in views[parent, pose].candidates:
-                options.append(of_child @ of_parent.inverse())
-                owners.append(pose)
-    if not options:
-        raise SolveError(
-            "two devices share board poses, and none of them gives a pose of the board"
-        )
+def _medoid(options: list[Pose], owner: Ints) -> tuple[Pose, Bools]:
+    """The motion that most owners (O,) offer one near to, and which owners do.
+
+    Args:
+        options: motions.
+        owner: (len(options),) whose option each is, from 0, ascending.
+    """
     turns = np.stack([option.rotation for option in options])
     shifts = np.stack([option.translation for option in options])
     trace = np.einsum("aij,bij->ab", turns, turns)
@@ -245,9 +307,24 @@ def _medoid_relative(
     reach = max(float(np.median(np.linalg.norm(shifts, axis=1))), 1e-9)
     gap = np.linalg.norm(shifts[:, None] - shifts[None], axis=2) / reach
     distance = np.minimum(angle + gap, _CAP)
-    owner = np.array(owners)
-    cost = sum(distance[:, owner == pose].min(axis=1) for pose in sorted(set(owners)))
-    return options[int(np.argmin(cost))]
+    starts = np.flatnonzero(np.diff(owner, prepend=-1))
+    nearest = np.minimum.reduceat(distance, starts, axis=1)
+    best = int(np.argmin(nearest.sum(axis=1)))
+    return options[best], nearest[best] < _AGREEING
+
+
+def board_poses(
+    observations: BoardObservations, shape: BoardShape, cameras: CameraArray
+) -> tuple[Pose, ...]:
+    """Board poses array_from_board before an array that is known; the identity where none is seen.
+
+    Args:
+        observations: corner sightings.
+        shape: the board, every face of it placed.
+        cameras: the array.
+    """
+    views = _pose_candidates(observations, shape, list(cameras))
+    return _board_poses(observations, shape.corners, cameras, views)
 
 
 def _board_poses(

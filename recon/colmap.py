@@ -10,18 +10,19 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pycolmap
 
-from capture.arrays import Floats, Ints
 from capture.camera import Camera, CameraArray
 from capture.errors import CameraError, SolveError, raise_all
 from capture.pose import Pose
 from capture.product import replacing
 from recon.array_state import ArrayState
+from recon.camera_parts import check_unit, rigid, scaled
+from recon.colmap_files import check_model_files, name_images
 from recon.observations import BoardObservations
 
 _HALF_PIXEL = 0.5
@@ -33,9 +34,8 @@ _PARAMETERS = {  # where fx fy cx cy k1 k2 p1 p2 stand among each model's parame
     "OPENCV": (0, 1, 2, 3, 4, 5, 6, 7),
     "FULL_OPENCV": (0, 1, 2, 3, 4, 5, 6, 7),
 }
-_MODEL_FILES = ("cameras", "images", "points3D")
 _SAME_PLACE = 1e-6  # two images of one camera must agree on its pose to this
-_VENDOR = (ValueError, RuntimeError, IndexError, KeyError, TypeError)
+_VENDOR = (ValueError, RuntimeError, IndexError, KeyError, TypeError, MemoryError)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,8 +47,11 @@ class AdjustOptions:
         free_lenses: focal lengths, principal points and distortion.
         free_principal_points: principal points (only with free lenses).
         free_cameras: where the devices stand in the array.
-        free_board: the board's shape, three corners of it held.
+        free_board: the board's shape. Nothing fixes its space and the scale then: the result may
+            have moved by them, see `recon.array_gauge`.
         iterations: at most this many steps.
+        moving: indices of the devices whose place and lens may move while the others are held to
+            the last bit; None lets all move.
     """
 
     loss_px: float = 0.5
@@ -57,6 +60,7 @@ class AdjustOptions:
     free_cameras: bool = True
     free_board: bool = False
     iterations: int = 60
+    moving: tuple[int, ...] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,16 +90,21 @@ def adjust_array(
         options: what may move.
 
     Raises:
-        SolveError: when the solver fails or returns something that is not an array.
+        SolveError: when the solver fails or returns something that is not an array, or when
+            `options.moving` names a device that is not there or leaves none to hold.
+        CameraError: when a lens that may move has a k3.
 
     References:
         Triggs et al. 2000, Bundle Adjustment - A Modern Synthesis; COLMAP's rigs and frames.
     """
     seen = np.bincount(observations.corner, minlength=len(state.corners))
     observations = observations.select(seen[observations.corner] > 1)  # COLMAP wants tracks
+    reference = _reference(state.cameras, options)
     with _vendor("bundle adjustment"):
-        problem = _build(state, observations)
-        config = _config(problem, observations, state.corners, options)
+        problem = _build(state, observations, reference)
+        config = _config(problem, options)
+        if options.moving is not None:
+            _hold(config, problem, options.moving, reference)
         adjuster = pycolmap.create_default_ceres_bundle_adjuster(
             _ceres_options(options), config, problem
         )
@@ -103,7 +112,13 @@ def adjust_array(
         if not summary.is_solution_usable():
             raise SolveError(f"bundle adjustment failed: {summary.brief_report()}")
         converged = summary.termination_type == pycolmap.BundleAdjustmentTerminationType.CONVERGENCE
-        return Adjustment(_read_back(problem, state, observations), bool(converged))
+        found = _read_back(problem, state, observations, reference)
+    if options.moving is not None:
+        moving = set(options.moving)
+        pairs = enumerate(zip(state.cameras, found.cameras, strict=True))
+        cameras = tuple(new if at in moving else old for at, (old, new) in pairs)
+        found = ArrayState(CameraArray(cameras), found.array_from_board, found.corners)
+    return Adjustment(found, bool(converged))
 
 
 def to_colmap(camera: Camera, camera_id: int, model: str = "OPENCV") -> pycolmap.Camera:
@@ -166,71 +181,107 @@ def from_colmap(camera: pycolmap.Camera, name: str, camera_from_world: Pose) -> 
     )  # fmt: skip
 
 
-def read_model(folder: Path) -> CameraArray:
-    """Read the cameras of a COLMAP sparse model, text or binary.
+def read_model(folder: Path, *, unit_mm: float = 1.0) -> CameraArray:
+    """Read the cameras of a COLMAP sparse model, text or binary, with rigs or without.
 
     A camera is named after the folder its images lie in, or, when all images lie in one folder,
-    after its image. The world is the model's, its unit taken as a millimetre: a model in metres
-    must be scaled before.
+    after its image. The world is the model's. In a model of one rig whose frames stand in several
+    places, as a waved board gives, each sensor is a camera and the world is the rig's space.
 
     Args:
-        folder: holding cameras, images and points3D as .bin or .txt.
+        folder: holding cameras, images and points3D (and rigs and frames) as .bin or .txt.
+        unit_mm: millimetres of the model's unit, which COLMAP leaves open.
 
     Raises:
         CameraError: naming the folder and every image or camera that does not fit.
     """
     folder = Path(folder)
-    if not any(all((folder / f"{n}{e}").is_file() for n in _MODEL_FILES) for e in (".bin", ".txt")):
-        raise CameraError(
-            f"{folder}: expected a COLMAP model: cameras, images and points3D, all .bin or all .txt"
-        )
-    model = pycolmap.Reconstruction()
+    check_unit(unit_mm)
+    check_model_files(folder)
     try:
         with _vendor(f"{folder}: not readable as a COLMAP model"):
+            model = pycolmap.Reconstruction()
             model.read(str(folder))
-            images = sorted(model.images.values(), key=lambda image: str(image.name))
-            posed = [image for image in images if image.has_pose]
+            return scaled(_array(model, str(folder)), unit_mm)
     except SolveError as error:
         raise CameraError(str(error)) from error
+
+
+def _array(model: pycolmap.Reconstruction, where: str) -> CameraArray:
+    images = sorted(model.images.values(), key=lambda image: str(image.name))
+    posed = [image for image in images if image.has_pose]
     if not posed:
-        raise CameraError(f"{folder}: {len(images)} images, none of them with a pose")
-    flat = len({PurePosixPath(image.name).parent for image in posed}) == 1 and len(posed) > 1
+        raise CameraError(f"{where}: {len(images)} images, none of them with a pose")
+    rigs = {image.frame.rig_id for image in posed}
+    rig: Any = model.rig(rigs.pop()) if len(rigs) == 1 else None
+    one_rig = rig is not None and rig.num_sensors() > 1
+    problems = [
+        f"sensor {sensor.id} of the rig has no known sensor_from_rig; solve for it first"
+        for sensor, place in (rig.non_ref_sensors.items() if one_rig else ())
+        if place is None
+    ]
+    raise_all(where, problems, CameraError)
+    places = [image.frame.rig_from_world.matrix() for image in posed]
+    waved = one_rig and not all(np.allclose(p, places[0], atol=_SAME_PLACE) for p in places)
+    names = name_images([(str(i.name), int(i.camera_id)) for i in posed], where, one_rig=one_rig)
     cameras: dict[str, Camera] = {}
-    problems: list[str] = []
-    for image in posed:
-        path = PurePosixPath(str(image.name).replace("\\", "/"))
-        name = path.stem if flat or path.parent.name == "" else path.parent.name
+    for image, name in zip(posed, names, strict=True):
+        place = image.cam_from_world()
+        if waved:
+            sensor = image.camera.sensor_id
+            known = not rig.is_ref_sensor(sensor)
+            place = rig.sensor_from_rig(sensor) if known else pycolmap.Rigid3d()
         try:
-            camera = from_colmap(image.camera, name, _pose(image.cam_from_world()))
+            camera = from_colmap(image.camera, name, rigid(place.matrix(), 1.0, str(image.name)))
         except CameraError as error:
             problems.append(str(error))
             continue
-        if name in cameras and not _same(cameras[name], camera):
+        if not _same(cameras.setdefault(name, camera), camera):
             problems.append(
                 f"{name}: {image.name} has another lens or place than the images before it"
             )
-        cameras.setdefault(name, camera)
-    raise_all(str(folder), list(dict.fromkeys(problems)), CameraError)
+    raise_all(where, list(dict.fromkeys(problems)), CameraError)
     return CameraArray(tuple(cameras.values()))
 
 
-def write_model(folder: Path, cameras: CameraArray, *, text: bool = False) -> None:
-    """Write the array as a COLMAP sparse model: one image `NAME/0000.png` a camera, no points.
+def write_model(
+    folder: Path, cameras: CameraArray, *, text: bool = False, unit_mm: float = 1.0
+) -> None:
+    """Write the array as a COLMAP sparse model: one rig, one frame, no points.
+
+    The rig has a sensor a camera, the first of them the reference; the one frame has an image
+    `NAME/0000.png` a camera. Cameras without k3 are OPENCV, those with it FULL_OPENCV.
 
     Args:
         folder: to write or replace, whole or not at all.
-        cameras: the array; its millimetres become the model's unit.
+        cameras: the array.
         text: .txt files rather than .bin.
+        unit_mm: millimetres of the model's unit.
     """
-    model = pycolmap.Reconstruction()
+    check_unit(unit_mm)
+    cameras = scaled(cameras, 1.0 / unit_mm)
+    origin = cameras[0].camera_from_world
     with _vendor("writing a COLMAP model"):
+        model, rig = pycolmap.Reconstruction(), pycolmap.Rig(rig_id=1)
+        frame = pycolmap.Frame(frame_id=1, rig_id=1)
+        frame.rig_from_world = _rigid(origin)
+        images = []
         for number, camera in enumerate(cameras, start=1):
-            kind = "FULL_OPENCV" if camera.distortion[4] != 0 else "OPENCV"
-            model.add_camera_with_trivial_rig(to_colmap(camera, number, kind))
-            image = pycolmap.Image(
-                name=f"{camera.name}/0000.png", camera_id=number, image_id=number
-            )
-            model.add_image_with_trivial_frame(image, _rigid(camera.camera_from_world))
+            lens = to_colmap(camera, number, _model(camera))
+            model.add_camera(lens)
+            if number == 1:
+                rig.add_ref_sensor(lens.sensor_id)
+            else:
+                place = camera.camera_from_world @ origin.inverse()
+                rig.add_sensor(lens.sensor_id, _rigid(place))
+            frame.add_data_id(pycolmap.data_t(lens.sensor_id, number))
+            name = f"{camera.name}/0000.png"
+            images.append(pycolmap.Image(name=name, camera_id=number, image_id=number))
+        model.add_rig(rig)
+        model.add_frame(frame)
+        for image in images:
+            image.frame_id = 1
+            model.add_image(image)
         with replacing(folder) as partial:
             partial.mkdir()
             (model.write_text if text else model.write_binary)(str(partial))
@@ -251,25 +302,67 @@ def _vendor(what: str) -> Iterator[None]:
         pycolmap.logging.minloglevel = level
 
 
-def _build(state: ArrayState, observations: BoardObservations) -> pycolmap.Reconstruction:
+def _model(camera: Camera) -> str:
+    return "FULL_OPENCV" if camera.distortion[4] != 0 else "OPENCV"
+
+
+def _reference(cameras: CameraArray, options: AdjustOptions) -> int:
+    """The device in whose space the others stand: the first that is held."""
+    count = len(cameras)
+    free = range(count) if options.moving is None else options.moving
+    for index in free if options.free_lenses else ():
+        if 0 <= index < count and _model(cameras[index]) != "OPENCV":
+            raise CameraError(
+                f"{cameras[index].name}: a lens with k3 = {cameras[index].distortion[4]:g} is not "
+                "solved for; hold the lenses, or start from k3 = 0"
+            )
+    if options.moving is None:
+        return 0
+    strange = sorted(set(options.moving) - set(range(count)))
+    held = [index for index in range(count) if index not in options.moving]
+    if strange or not held:
+        raise SolveError(
+            f"moving: expected some of the devices 0..{count - 1} and not all of them, "
+            f"found {sorted(options.moving)}"
+        )
+    return held[0]
+
+
+def _hold(
+    config: pycolmap.BundleAdjustmentConfig,
+    problem: pycolmap.Reconstruction,
+    moving: tuple[int, ...],
+    reference: int,
+) -> None:
+    """Hold lens and place of every device that must not move."""
+    for number in sorted(problem.cameras):
+        if number - 1 not in moving:
+            config.set_constant_cam_intrinsics(number)
+            if number - 1 != reference:
+                config.set_constant_sensor_from_rig_pose(problem.camera(number).sensor_id)
+
+
+def _build(
+    state: ArrayState, observations: BoardObservations, reference: int = 0
+) -> pycolmap.Reconstruction:
     """One rig, one frame a pose, one image a view, one point a corner that was seen."""
     problem = pycolmap.Reconstruction()
-    reference = state.cameras[0].camera_from_world
+    origin = state.cameras[reference].camera_from_world
     rig = pycolmap.Rig(rig_id=1)
     sensors = []
     for index, camera in enumerate(state.cameras):
-        lens = to_colmap(camera, index + 1)
+        lens = to_colmap(camera, index + 1, _model(camera))
         problem.add_camera(lens)
         sensors.append(lens.sensor_id)
-        if index == 0:
-            rig.add_ref_sensor(lens.sensor_id)
-        else:
-            rig.add_sensor(lens.sensor_id, _rigid(camera.camera_from_world @ reference.inverse()))
+    rig.add_ref_sensor(sensors[reference])  # before all others
+    for index, camera in enumerate(state.cameras):
+        if index != reference:
+            rig.add_sensor(sensors[index], _rigid(camera.camera_from_world @ origin.inverse()))
     problem.add_rig(rig)
     views = list(observations.views())
     for pose in np.unique(observations.pose).tolist():
         frame = pycolmap.Frame(frame_id=pose + 1, rig_id=1)
-        frame.rig_from_world = _rigid(reference @ state.array_from_board[pose])
+        frame.rig_from_world = _rigid(origin @ state.array_from_board[pose])
         for number, (device, seen, _) in enumerate(views, start=1):
             if seen == pose:
                 frame.add_data_id(pycolmap.data_t(sensors[device], number))
@@ -291,38 +384,15 @@ def _build(state: ArrayState, observations: BoardObservations) -> pycolmap.Recon
 
 
 def _config(
-    problem: pycolmap.Reconstruction,
-    observations: BoardObservations,
-    corners: Floats,
-    options: AdjustOptions,
+    problem: pycolmap.Reconstruction, options: AdjustOptions
 ) -> pycolmap.BundleAdjustmentConfig:
     config = pycolmap.BundleAdjustmentConfig()
     for number in sorted(problem.images):
         config.add_image(number)
-    if options.free_board:
-        for corner in held_corners(observations, corners):
-            config.add_constant_point(int(corner) + 1)
-    else:
+    if not options.free_board:
         for number in sorted(problem.points3D):
             config.add_constant_point(number)
     return config
-
-
-def held_corners(observations: BoardObservations, corners: Floats) -> Ints:
-    """The three corners (3,) that fix the gauge: well seen, and spanning the widest triangle."""
-    seen = np.bincount(observations.corner, minlength=len(corners))
-    often = np.flatnonzero(seen >= max(0.5 * float(np.median(seen[seen > 0])), 1.0))
-    flat = corners[often, :2]
-    first = int(np.argmin(flat.sum(axis=1)))
-    second = int(np.argmax(np.linalg.norm(flat - flat[first], axis=1)))
-    edge = flat[second] - flat[first]
-    away = np.abs(edge[0] * (flat[:, 1] - flat[first, 1]) - edge[1] * (flat[:, 0] - flat[first, 0]))
-    third = int(np.argmax(away))
-    if away[third] <= 0:
-        raise SolveError(
-            "the corners seen on the board lie on one line: no three of them fix its space"
-        )
-    return often[[first, second, third]]
 
 
 def _ceres_options(options: AdjustOptions) -> pycolmap.BundleAdjustmentOptions:
@@ -344,20 +414,23 @@ def _ceres_options(options: AdjustOptions) -> pycolmap.BundleAdjustmentOptions:
 
 
 def _read_back(
-    problem: pycolmap.Reconstruction, state: ArrayState, observations: BoardObservations
+    problem: pycolmap.Reconstruction,
+    state: ArrayState,
+    observations: BoardObservations,
+    reference: int,
 ) -> ArrayState:
-    reference = state.cameras[0].camera_from_world
+    origin = state.cameras[reference].camera_from_world
     rig = problem.rig(1)
     cameras = []
     for index, camera in enumerate(state.cameras):
         lens = problem.camera(index + 1)
-        place = reference
-        if index > 0:
-            place = _pose(rig.sensor_from_rig(lens.sensor_id)) @ reference
+        place = origin
+        if index != reference:
+            place = _pose(rig.sensor_from_rig(lens.sensor_id)) @ origin
         cameras.append(from_colmap(lens, camera.name, place))
     poses = list(state.array_from_board)
     for pose in np.unique(observations.pose).tolist():
-        poses[pose] = reference.inverse() @ _pose(problem.frame(pose + 1).rig_from_world)
+        poses[pose] = origin.inverse() @ _pose(problem.frame(pose + 1).rig_from_world)
     corners = np.array(state.corners)
     for number in sorted(problem.points3D):
         corners[number - 1] = problem.point3D(number).xyz

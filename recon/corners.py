@@ -1,19 +1,17 @@
-"""ChArUco corners of one image, and of a whole board take."""
+"""Corners of a board, or of the faces of a body, in one image, and whether the view is good."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-import cv2
 import numpy as np
 
 from capture.arrays import Floats, Floats32, Image, Ints
-from capture.progress import Progress, silent
+from recon.april_grid import AprilGrid
 from recon.board import Board
-from recon.images import mono
-from recon.observations import BoardObservations
+from recon.board_body import BoardBody
+from recon.marker_search import BarSearch, FaceSearch, levels
 
 NO_BOARD = "no board"
 FEW_CORNERS = "few corners"
@@ -24,7 +22,9 @@ STILL = "board had not moved"
 SPARE = "more poses than needed"
 USED = "used"
 _LINE = 0.5  # corners must spread by this much of a square across their main direction
+_TAG_LINE = 0.45  # the same of a tag: one row of tags is enough
 _BLUR_PATCHES = 16
+_REFUSALS = (NO_BOARD, FEW_CORNERS, ONE_LINE, BLURRED)  # the later, the nearer to a good view
 
 
 class BoardTake(Protocol):
@@ -53,10 +53,10 @@ class CornerLimits:
     """When a view of the board is good enough to use.
 
     Attributes:
-        min_corners: fewer corners than this are refused.
+        min_corners: fewer corners of one face than this are refused.
         max_blur_px: a wider edge (standard deviation of its spread, px) is refused.
         still_px: a frame where no corner moved by more than this since the last is left out.
-        max_poses: of more board poses than this, so many are used, evenly spread over the take.
+        max_poses: of more board poses than this, so many are used, those that show most.
     """
 
     min_corners: int = 6
@@ -70,9 +70,10 @@ class CornerView:
     """What one image shows of the board.
 
     Attributes:
-        ids: (N,) corner ids, ascending.
+        ids: (N,) corner ids of the body, ascending.
         pixels: (N, 2) (column, row), px, centre of the first pixel at 0.
-        blur_px: standard deviation of the spread of the board's edges; NaN when there is no board.
+        blur_px: standard deviation of the spread of the board's edges, of the softest face that is
+            used; NaN when there is no board.
         refusal: why the view must not be used, or "".
     """
 
@@ -82,20 +83,62 @@ class CornerView:
     refusal: str
 
 
-class CornerDetector:
-    """Finds the corners of one board in images of 8 to 16 bits, mono or colour."""
+@dataclass(frozen=True, eq=False)
+class FaceCorners:
+    """The corners of one face in one image, before anyone judged them.
 
-    def __init__(self, board: Board, limits: CornerLimits | None = None) -> None:
-        self._board = board
+    Attributes:
+        ids: (N,) corner ids on that face, ascending.
+        pixels: (N, 2) px.
+        blur_px: width of the edges there, see `edge_spread`; NaN without corners.
+    """
+
+    ids: Ints
+    pixels: Floats
+    blur_px: float
+
+
+@dataclass(frozen=True, eq=False)
+class CornerFinds:
+    """All that was found in one image: it does not depend on any limit.
+
+    Attributes:
+        faces: of each face of the body, its corners.
+        ends: (E,) which ends of the scale bar were found, 0 or 1.
+        end_pixels: (E, 2) the centres of their markers, px.
+    """
+
+    faces: tuple[FaceCorners, ...]
+    ends: Ints
+    end_pixels: Floats
+
+
+class CornerDetector:
+    """Finds the corners of a board or a body in images of 8 to 16 bits, mono or colour.
+
+    One detector may be used by several threads, as long as each call has its own image.
+    """
+
+    def __init__(
+        self, board: Board | AprilGrid | BoardBody, limits: CornerLimits | None = None
+    ) -> None:
+        body = board if isinstance(board, BoardBody) else BoardBody.of(board)
+        self._body = body
         self._limits = limits or CornerLimits()
-        self._flat = board.corners_mm()[:, :2]
-        markers = cv2.aruco.DetectorParameters()
-        markers.adaptiveThreshWinSizeMin = 13
-        markers.cornerRefinementMinAccuracy = 1e-3  # the default of 0.1 px stops too early
-        markers.cornerRefinementMaxIterations = 100
-        self._detector = cv2.aruco.CharucoDetector(
-            board.pattern(), cv2.aruco.CharucoParameters(), markers
-        )
+        self._flat = [face.board.corners_mm()[:, :2] for face in body.faces]
+        alike: dict[tuple[str, str, int], list[int]] = {}
+        for place, face in enumerate(body.faces):
+            alike.setdefault(FaceSearch.alike(face.board), []).append(place)
+        self._searches = [
+            (places, FaceSearch([body.faces[place].board for place in places]))
+            for places in alike.values()
+        ]
+        self._bar = None if body.scale_bar is None else BarSearch(body.scale_bar)
+
+    @property
+    def body(self) -> BoardBody:
+        """What is searched for."""
+        return self._body
 
     def detect(self, image: Image) -> CornerView:
         """Corners of the board in one image, with the reason when they must not be used.
@@ -105,35 +148,66 @@ class CornerDetector:
 
         Returns:
             The corners found, refined to a fraction of a pixel.
-
-        References:
-            Garrido-Jurado et al. 2014 (markers); Foerstner and Guelch 1987 (sub-pixel saddles).
         """
-        grey = mono(image)
-        bright = float(np.percentile(grey[::3, ::3], 99.5))
-        grey = np.clip(grey * np.float32(255.0 / max(bright, 1e-6)), 0, 255).astype(np.float32)
-        corners, ids, _, _ = self._detector.detectBoard(np.round(grey).astype(np.uint8))
-        if ids is None or len(ids) == 0:
-            return CornerView(np.zeros(0, np.int64), np.zeros((0, 2)), float("nan"), NO_BOARD)
-        order = np.argsort(np.ravel(ids), kind="stable")
-        found = np.ravel(ids)[order].astype(np.int64)
-        pixels = np.asarray(corners, dtype=np.float64).reshape(-1, 2)[order]
-        blur, refusal = float("nan"), ""
-        if len(found) < self._limits.min_corners:
-            refusal = FEW_CORNERS
-        elif self._spread(found) < _LINE * self._board.square_mm:
-            refusal = ONE_LINE
-        else:
-            blur = edge_spread(grey, pixels, self._flat[found], self._board.square_mm)
-            refusal = BLURRED if not blur <= self._limits.max_blur_px else ""
-        return CornerView(found, pixels, blur, refusal)
+        return self.judge(self.find(image))
 
-    def _spread(self, ids: Ints) -> float:
-        flat = self._flat[ids] - self._flat[ids].mean(axis=0)
-        return float(np.linalg.svd(flat, compute_uv=False)[1]) / float(np.sqrt(len(ids)))
+    def find(self, image: Image) -> CornerFinds:
+        """All that one image shows, good enough or not.
+
+        Args:
+            image: (H, W) or (H, W, 3), uint8 or uint16.
+        """
+        grey, in_bytes = levels(image)
+        faces: dict[int, FaceCorners] = {}
+        markers = [np.zeros((0, 4, 2))]
+        for places, search in self._searches:
+            found, quads = search.find(grey, in_bytes)
+            markers.append(quads)
+            for place, (ids, pixels) in zip(places, found, strict=True):
+                pitch = self._body.faces[place].board.pitch_mm
+                blur = float("nan")
+                if len(ids):
+                    blur = edge_spread(grey, pixels, self._flat[place][ids], pitch)
+                faces[place] = FaceCorners(ids, pixels, blur)
+        ends, end_pixels = np.zeros(0, np.int64), np.zeros((0, 2))
+        if self._bar is not None:
+            ends, end_pixels = self._bar.find(grey, in_bytes, np.concatenate(markers))
+        return CornerFinds(tuple(faces[place] for place in sorted(faces)), ends, end_pixels)
+
+    def judge(self, finds: CornerFinds) -> CornerView:
+        """Which of the corners found may be used.
+
+        A face that shows too little, or is blurred, is left out; when none remains the view is
+        refused for the reason of the face that came nearest, with all its corners.
+        """
+        reasons = [self._refusal(place, face) for place, face in enumerate(finds.faces)]
+        good = [place for place, reason in enumerate(reasons) if not reason]
+        taken = good or list(range(len(reasons)))
+        ids = [finds.faces[place].ids + self._body.corner_range(place).start for place in taken]
+        pixels = [finds.faces[place].pixels for place in taken]
+        refusal = "" if good else max(reasons, key=_REFUSALS.index)
+        blurs = [finds.faces[place].blur_px for place in taken if reasons[place] in ("", BLURRED)]
+        return CornerView(
+            np.concatenate(ids), np.concatenate(pixels), max(blurs, default=float("nan")), refusal
+        )
+
+    def _refusal(self, place: int, face: FaceCorners) -> str:
+        board = self._body.faces[place].board
+        if not len(face.ids):
+            return NO_BOARD
+        if len(face.ids) < self._limits.min_corners:
+            return FEW_CORNERS
+        line = _TAG_LINE * board.tag_mm if isinstance(board, AprilGrid) else _LINE * board.square_mm
+        flat = self._flat[place][face.ids]
+        across = np.linalg.svd(flat - flat.mean(axis=0), compute_uv=False)[1]
+        if float(across) / float(np.sqrt(len(face.ids))) < line:
+            return ONE_LINE
+        return "" if face.blur_px <= self._limits.max_blur_px else BLURRED
 
 
-def detect_corners(image: Image, board: Board, limits: CornerLimits | None = None) -> CornerView:
+def detect_corners(
+    image: Image, board: Board | AprilGrid | BoardBody, limits: CornerLimits | None = None
+) -> CornerView:
     """Corners of a board in one image; for many images make one `CornerDetector`."""
     return CornerDetector(board, limits).detect(image)
 
@@ -169,90 +243,3 @@ def edge_spread(grey: Floats32, pixels: Floats, flat: Floats, square_mm: float) 
         slopes = [np.percentile(np.abs(axis[0] * across + axis[1] * down), 95) for axis in axes]
         spreads.append((high - low) / (np.sqrt(2 * np.pi) * max(min(slopes), 1e-9)))
     return float(np.median(spreads)) if spreads else float("inf")
-
-
-def observe_board(
-    take: BoardTake, board: Board, limits: CornerLimits, *, progress: Progress = silent
-) -> tuple[BoardObservations, dict[str, dict[str, int]]]:
-    """Find the board in every image of a take.
-
-    Args:
-        take: the board take.
-        board: the board waved in it.
-        limits: which views to refuse.
-        progress: told after each frame.
-
-    Returns:
-        The sightings of all usable views, poses being the frames in which any device has one; and,
-        by device, how many frames were used or refused for each reason.
-    """
-    detector = CornerDetector(board, limits)
-    tally: dict[str, dict[str, int]] = {name: {} for name in take.device_names}
-    poses: list[tuple[int, dict[str, CornerView]]] = []
-    for done, frame in enumerate(take.frames, start=1):
-        views: dict[str, CornerView] = {}
-        for name in take.device_names:
-            reason = LOST
-            if take.present(name, frame):
-                view = detector.detect(take.image(name, frame))
-                reason = view.refusal or USED
-                if not view.refusal:
-                    views[name] = view
-            tally[name][reason] = tally[name].get(reason, 0) + 1
-        if views and poses and _still(poses[-1][1], views, limits.still_px):
-            _move(tally, views, STILL)
-        elif views:
-            poses.append((frame, views))
-        progress(done, len(take.frames), "corners")
-    chosen = poses
-    if len(poses) > limits.max_poses:
-        places = np.linspace(0, len(poses) - 1, limits.max_poses).round().astype(int).tolist()
-        chosen = [poses[place] for place in places]
-        for _, spare in (pose for place, pose in enumerate(poses) if place not in set(places)):
-            _move(tally, spare, SPARE)
-    return _collect(take, chosen), tally
-
-
-def _move(tally: dict[str, dict[str, int]], views: Mapping[str, CornerView], reason: str) -> None:
-    """Count these used views under another reason."""
-    for name in views:
-        tally[name][USED] -= 1
-        tally[name][reason] = tally[name].get(reason, 0) + 1
-
-
-def _still(
-    before: Mapping[str, CornerView], now: Mapping[str, CornerView], still_px: float
-) -> bool:
-    """Whether the devices that saw the board twice saw it at the same place."""
-    shared = 0
-    for name in before.keys() & now.keys():
-        _, first, second = np.intersect1d(before[name].ids, now[name].ids, return_indices=True)
-        if len(first):
-            shared += 1
-            moved = np.linalg.norm(before[name].pixels[first] - now[name].pixels[second], axis=1)
-            if float(np.median(moved)) > still_px:
-                return False
-    return shared > 0
-
-
-def _collect(
-    take: BoardTake, poses: Sequence[tuple[int, Mapping[str, CornerView]]]
-) -> BoardObservations:
-    device, pose, corner, pixels = [], [], [], [np.zeros((0, 2))]
-    for place, (_, views) in enumerate(poses):
-        for index, name in enumerate(take.device_names):
-            if name in views:
-                count = len(views[name].ids)
-                device += [index] * count
-                pose += [place] * count
-                corner += views[name].ids.tolist()
-                pixels.append(views[name].pixels)
-    return BoardObservations(
-        device_names=tuple(take.device_names),
-        sizes=tuple(take.size(name) for name in take.device_names),
-        frames=tuple(frame for frame, _ in poses),
-        device=np.array(device, dtype=np.int64),
-        pose=np.array(pose, dtype=np.int64),
-        corner=np.array(corner, dtype=np.int64),
-        pixels=np.concatenate(pixels),
-    )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -65,6 +65,18 @@ class BoardObservations:
             device_names=self.device_names, sizes=self.sizes, frames=self.frames,
             device=self.device[keep], pose=self.pose[keep], corner=self.corner[keep],
             pixels=self.pixels[keep],
+        )  # fmt: skip
+
+    def of_devices(self, devices: Sequence[int]) -> BoardObservations:
+        """Only these devices, given by index, which are counted anew in this order."""
+        place = np.full(len(self.device_names), -1, dtype=np.int64)
+        place[list(devices)] = np.arange(len(devices))
+        rows = place[self.device] >= 0
+        return BoardObservations(
+            device_names=tuple(self.device_names[index] for index in devices),
+            sizes=tuple(self.sizes[index] for index in devices), frames=self.frames,
+            device=place[self.device[rows]], pose=self.pose[rows], corner=self.corner[rows],
+            pixels=self.pixels[rows],
         )  # fmt: skip
 
     def views(self) -> Iterator[tuple[int, int, slice]]:

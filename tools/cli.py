@@ -26,7 +26,11 @@ from tools.progress_bar import ProgressBar
 VERBS: dict[str, str] = {
     "demo": "run a simulated 16-camera session through every stage and report",
     "import": "make a take of a visiting folder of images",
+    "board": "draw a calibration board to print, at true scale",
     "calibrate": "solve the cameras of an array from a board take",
+    "cameras": "carry cameras between ours, COLMAP, OpenCV, Metashape and Kalibr",
+    "photometric": "measure black level, gain and lens falloff of every device",
+    "drift": "check from a few board poses whether an array still stands as calibrated",
     "recon": "reconstruct the surface of frames by stereo",
     "neutral": "register a template mesh to the actor at the first frame",
     "landmarks": "find lips, lids, brows and nose in every frame, by a predictor of this actor",
@@ -45,6 +49,8 @@ VERBS: dict[str, str] = {
 _MODULES = {"import": "tools.verbs.visit", "demo": "tools.verbs.demonstrate"}
 _STAGES = {
     "calibrate": ("recon.array_solver", "CalibrateSettings"),
+    "photometric": ("recon.photometric_sources", "PhotometricSettings"),
+    "drift": ("recon.array_drift", "DriftSettings"),
     "recon": ("recon.scan", "ReconSettings"),
     "neutral": ("track.neutral", "NeutralSettings"),
     "landmarks": ("track.landmark_stage", "LandmarkSettings"),

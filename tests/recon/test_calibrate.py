@@ -17,13 +17,15 @@ from capture.camera_file import read_cameras
 from capture.errors import SettingsError, SolveError, TakeError
 from capture.pose import Pose
 from capture.take import Take
-from recon.array_solver import ArraySolution, CalibrateSettings, check_views, solve_array
+from recon.array_solver import ArraySolution, CalibrateSettings, solve_array
 from recon.array_world import array_world
 from recon.board_chain import initial_state
+from recon.board_sightings import observe_board
 from recon.calibrate import calibrate, report_path
 from recon.calibration_report import calibration_report, summary_of
-from recon.corners import CornerLimits, observe_board
+from recon.corners import CornerLimits
 from recon.observations import BoardObservations
+from recon.view_check import check_views
 from recon.visiting import import_take
 from tools.bench.board_scene import (
     A4_BOARD,
@@ -191,7 +193,7 @@ def test_devices_that_saw_too_little_are_named_together() -> None:
     poor |= seen.device == 3
     tally = {"cam03": {"no board": 9, "blurred": 5}}
     with pytest.raises(TakeError) as caught:
-        check_views(without(seen, ~poor), CalibrateSettings(), tally)
+        check_views(without(seen, ~poor), 5, 4, tally)
     text = str(caught.value)
     assert "2 problems" in text
     assert "cam01: used the board in 1 frames" in text
@@ -253,9 +255,11 @@ def test_the_stage_writes_cameras_report_and_record_once(tmp_path: Path) -> None
     report = json.loads(report_path(out).read_text(encoding="utf-8"))
     assert report["mean_reprojection_px"] < 0.1
     assert read_cameras(out).names == take.device_names
-    thinned, tally = observe_board(take, A4_BOARD, CornerLimits(max_poses=3))
-    assert thinned.frames == (0, 3, 6)
-    assert sum(counts.get("more poses than needed", 0) for counts in tally.values()) > 0
+    thinned = observe_board(take, A4_BOARD, CornerLimits(max_poses=3))
+    assert len(thinned.observations.frames) == 3
+    assert len(thinned.every.frames) == 7
+    spare = sum(counts.get("more poses than needed", 0) for counts in thinned.tally.values())
+    assert spare > 0
     take.set_cameras(cameras)
     before = out.read_bytes(), out.stat().st_mtime_ns
     steps: list[str] = []

@@ -14,6 +14,7 @@ from capture.pose import Pose
 from recon.array_state import ArrayState
 from recon.board import Board
 from recon.observations import BoardObservations
+from tools.bench.board_arrays import board_yaws, device_directions
 
 _PRINT = 8.0  # pixels of the drawn pattern a millimetre
 _FINE = 3  # samples a pixel, along each axis
@@ -24,7 +25,9 @@ class BoardScene:
     """How a synthetic board take looks.
 
     Attributes:
-        devices: how many cameras, on an arc of +-62 degrees before the face.
+        devices: how many cameras.
+        layout: how they stand, see `tools.bench.board_arrays`.
+        span_deg: how far to either side of the face.
         size_px: side of the square images.
         focal_px: mean focal length.
         radius_mm: distance of the cameras from the face.
@@ -37,6 +40,8 @@ class BoardScene:
     """
 
     devices: int = 16
+    layout: str = "arc"
+    span_deg: float = 62.0
     size_px: int = 2048
     focal_px: float = 4000.0
     radius_mm: float = 900.0
@@ -52,14 +57,15 @@ A4_BOARD = Board(
     squares_x=12, squares_y=9, square_mm=20.0, marker_mm=15.0, dictionary="DICT_5X5_1000"
 )
 
+FACING = Pose(np.diag([1.0, -1.0, -1.0]), np.zeros(3))  # board +Y down, +Z away from the face
+
 
 def make_array(scene: BoardScene) -> CameraArray:
-    """Cameras on three rows of an arc, looking at the origin, each with its own lens."""
+    """Cameras of the scene's layout, looking at the origin, each with its own lens."""
     random = np.random.default_rng([scene.seed, 1])
     cameras = []
-    for index in range(scene.devices):
-        yaw = np.radians(-62.0 + 124.0 * index / max(scene.devices - 1, 1))
-        pitch = np.radians((-18.0, 4.0, 22.0)[index % 3])
+    directions = device_directions(scene.layout, scene.devices, scene.span_deg)
+    for index, (yaw, pitch, roll) in enumerate(np.radians(directions).tolist()):
         centre = scene.radius_mm * np.array(
             [np.sin(yaw) * np.cos(pitch), np.sin(pitch), np.cos(yaw) * np.cos(pitch)]
         )
@@ -78,7 +84,7 @@ def make_array(scene: BoardScene) -> CameraArray:
                 cx=float(middle[0]),
                 cy=float(middle[1]),
                 distortion=bend,
-                camera_from_world=looking_at(centre, target),
+                camera_from_world=_rolled(roll) @ looking_at(centre, target),
             )
         )
     return CameraArray(tuple(cameras))
@@ -93,29 +99,42 @@ def looking_at(centre: Floats, target: Floats) -> Pose:
     return Pose(rotation, -rotation @ centre)
 
 
+def _rolled(roll: float) -> Pose:
+    return Pose.from_rotation_vector(np.array([0.0, 0.0, roll]), np.zeros(3))
+
+
 def make_state(scene: BoardScene, board: Board = A4_BOARD) -> ArrayState:
     """The true array, board poses and board shape."""
     random = np.random.default_rng([scene.seed, 2])
-    corners = board.corners_mm()
-    middle = corners.mean(axis=0)
-    across = (corners - middle)[:, :2] / np.abs(corners - middle)[:, :2].max(axis=0)
-    shape = corners.copy()
-    shape[:, 2] += scene.bow_mm * (1.0 - (across**2).sum(axis=1) / 2.0)
+    middle = board.corners_mm().mean(axis=0)
     poses = []
-    for index in range(scene.poses):
-        yaw = np.radians(np.linspace(-50, 50, scene.poses)[index] + random.normal(0, 6.0))
+    for mean_yaw in board_yaws(scene.layout, scene.span_deg, scene.poses):
+        yaw = np.radians(mean_yaw + random.normal(0, 6.0))
         pitch = np.radians(random.uniform(-35, 35))
         spin = np.radians(random.uniform(-25, 25))
-        facing = Pose(
-            np.diag([1.0, -1.0, -1.0]), np.zeros(3)
-        )  # board +Y down, +Z away from the face
         turn = (
             Pose.from_rotation_vector(np.array([0, yaw, 0]), random.normal(0, 35.0, 3))
             @ Pose.from_rotation_vector(np.array([pitch, 0, 0]), np.zeros(3))
             @ Pose.from_rotation_vector(np.array([0, 0, spin]), np.zeros(3))
         )
-        poses.append(turn @ facing @ Pose(np.eye(3), -middle))
-    return ArrayState(make_array(scene), tuple(poses), shape)
+        poses.append(turn @ FACING @ Pose(np.eye(3), -middle))
+    return ArrayState(make_array(scene), tuple(poses), bent_corners(board, scene.bow_mm))
+
+
+def bent_corners(board: Board, bow_mm: float) -> Floats:
+    """Corners (N, 3), board space, mm, of a board that is bowed along both of its axes."""
+    corners = board.corners_mm()
+    corners[:, 2] += bow_height(board, bow_mm, corners[:, :2])
+    return corners
+
+
+def bow_height(board: Board, bow_mm: float, flat: Floats) -> Floats:
+    """Height (...), mm along +Z, of places (..., 2) on a bowed board, mm on the flat one."""
+    corners = board.corners_mm()[:, :2]
+    middle = corners.mean(axis=0)
+    across = (flat - middle) / np.abs(corners - middle).max(axis=0)
+    height: Floats = bow_mm * (1.0 - (across**2).sum(axis=-1) / 2.0)
+    return height
 
 
 def observe(scene: BoardScene, truth: ArrayState) -> BoardObservations:
@@ -139,11 +158,11 @@ def observe(scene: BoardScene, truth: ArrayState) -> BoardObservations:
             angle = random.uniform(0, 2 * np.pi, len(seen))
             noisy += 6.0 * wrong[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
             rows += [(device, pose, int(n), *p) for n, p in zip(seen, noisy.tolist(), strict=True)]
-    table = np.array(rows)
+    table = np.array(rows).reshape(-1, 5)
     return BoardObservations(
         device_names=truth.cameras.names,
         sizes=tuple((camera.width, camera.height) for camera in truth.cameras),
-        frames=tuple(range(scene.poses)),
+        frames=tuple(range(len(truth.array_from_board))),
         device=table[:, 0].astype(np.int64), pose=table[:, 1].astype(np.int64),
         corner=table[:, 2].astype(np.int64), pixels=table[:, 3:],
     )  # fmt: skip
@@ -200,6 +219,31 @@ def _ideal_grid(camera: Camera) -> Floats:
     return fine
 
 
+def face_points(seed: int = 0) -> Floats:
+    """400 points (N, 3), mm, all through a ball of 80 mm about the origin."""
+    random = np.random.default_rng([seed, 4])
+    ball = random.normal(size=(400, 3))
+    points = 80.0 * ball / np.linalg.norm(ball, axis=1, keepdims=True)
+    points = points * random.random((400, 1)) ** (1 / 3)
+    return np.asarray(points, dtype=np.float64)
+
+
+def triangulate(truth: CameraArray, found: CameraArray, points: Floats) -> Floats:
+    """Where the found cameras see points (N, 3), mm, that the true ones project without noise.
+
+    The place nearest to all rays, in the world of the found cameras, mm.
+    """
+    normal: Floats = np.zeros((len(points), 3, 3))
+    right: Floats = np.zeros((len(points), 3))
+    for one, other in zip(truth, found, strict=True):
+        rays = other.rays(one.project(points))
+        across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
+        normal += across
+        right += across @ other.centre
+    solved = np.linalg.solve(normal, right[:, :, None])[:, :, 0]
+    return np.asarray(solved, dtype=np.float64)
+
+
 def triangulation_error(truth: CameraArray, found: CameraArray, seed: int = 0) -> Floats:
     """Errors (N, 3), mm, of the face volume triangulated with the found cameras.
 
@@ -209,18 +253,8 @@ def triangulation_error(truth: CameraArray, found: CameraArray, seed: int = 0) -
     References:
         Umeyama 1991 with the scale held at 1.
     """
-    random = np.random.default_rng([seed, 4])
-    ball = random.normal(size=(400, 3))
-    points = 80.0 * ball / np.linalg.norm(ball, axis=1, keepdims=True)
-    points *= random.random((400, 1)) ** (1 / 3)
-    normal = np.zeros((400, 3, 3))
-    right = np.zeros((400, 3))
-    for one, other in zip(truth, found, strict=True):
-        rays = other.rays(one.project(points))
-        across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
-        normal += across
-        right += across @ other.centre
-    solved = np.linalg.solve(normal, right[:, :, None])[:, :, 0]
+    points = face_points(seed)
+    solved = triangulate(truth, found, points)
     a, b = solved - solved.mean(axis=0), points - points.mean(axis=0)
     u, _, vt = np.linalg.svd(a.T @ b)
     u[:, 2] *= np.linalg.det(u @ vt)

@@ -254,13 +254,13 @@ def colour_scale(stops: Sequence[str], low: float, high: float, label: str) -> s
     """A bar of colours from `low` to `high`, with the unit in the label."""
     step = 200.0 / len(stops)
     parts = [
-        element("rect", x=10 + step * k, y=2, width=step + 0.5, height=10, fill=colour)
+        element("rect", x=16 + step * k, y=2, width=step + 0.5, height=10, fill=colour)
         for k, colour in enumerate(stops)
     ]
     for value in np.linspace(low, high, 3).tolist():
-        place = 10 + 200.0 * (value - low) / ((high - low) or 1.0)
+        place = 16 + 200.0 * (value - low) / ((high - low) or 1.0)
         parts.append(text(place, 26, number(value), class_="tick", text_anchor="middle"))
-    parts.append(text(218, 12, label, class_="tick"))
+    parts.append(text(224, 12, label, class_="tick"))
     return drawing(420.0, 30.0, "".join(parts), f"colour scale: {label}")
 
 

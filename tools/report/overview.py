@@ -32,6 +32,15 @@ def layout_section(inputs: ReportInputs) -> list[Section]:
     array = inputs.array
     if array is None:
         return []
+    body = array_facts(array) + array_plans(inputs)
+    return [Section(anchor="layout", title="Camera array", body=body)]
+
+
+def array_plans(inputs: ReportInputs) -> str:
+    """The array from above and from the side, to scale; nothing without cameras."""
+    array = inputs.array
+    if array is None:
+        return ""
     target = scene_centre(array)
     neutral = next((take.neutral for take in inputs.takes if take.neutral is not None), None)
     points = None if neutral is None else neutral.vertices
@@ -41,6 +50,12 @@ def layout_section(inputs: ReportInputs) -> list[Section]:
             _plan(array, target, points, (2, 1), (1, -1)), "From the side; the face looks right."
         ),
     ]
+    return gallery(views, "wide")
+
+
+def array_facts(array: CameraArray) -> str:
+    """Distances, sizes and angles of the array as a list of facts."""
+    target = scene_centre(array)
     away = np.array([np.linalg.norm(camera.centre - target) for camera in array])
     sample = [d / camera.fx for d, camera in zip(away, array, strict=True)]
     sizes = sorted({f"{camera.width} x {camera.height}" for camera in array})
@@ -52,13 +67,7 @@ def layout_section(inputs: ReportInputs) -> list[Section]:
         "focal length, px": _span([camera.fx for camera in array]),
         "widest angle between cameras, deg": round(_widest(array, target)),
     }
-    return [
-        Section(
-            anchor="layout",
-            title="Camera array",
-            body=facts(numbers) + gallery(views, "wide"),
-        )
-    ]
+    return facts(numbers)
 
 
 def timing_section(inputs: ReportInputs) -> list[Section]:

@@ -47,7 +47,9 @@ class Section:
     verdicts: tuple[Verdict, ...] = ()
 
 
-def write_page(title: str, lead: str, sections: Sequence[Section], out: Path) -> None:
+def write_page(
+    title: str, lead: str, sections: Sequence[Section], out: Path, *, summary: str = ""
+) -> None:
     """Write the sections as one self-contained HTML page, whole or not at all.
 
     Args:
@@ -55,6 +57,7 @@ def write_page(title: str, lead: str, sections: Sequence[Section], out: Path) ->
         lead: HTML under the title, above the verdicts.
         sections: in order.
         out: the file.
+        summary: HTML instead of the list of all verdicts; empty keeps the list.
     """
     css = resources.files("tools.report").joinpath("page.css").read_text(encoding="utf-8")
     verdicts = [verdict for section in sections for verdict in section.verdicts]
@@ -72,7 +75,7 @@ def write_page(title: str, lead: str, sections: Sequence[Section], out: Path) ->
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         f"<title>{escape(title)}</title><style>{css}</style></head><body>"
         f"<nav><strong>{escape(title)}</strong>{contents}</nav><main>"
-        f"<header><h1>{escape(title)}</h1>{lead}{_summary(verdicts)}</header>{body}"
+        f"<header><h1>{escape(title)}</h1>{lead}{summary or _summary(verdicts)}</header>{body}"
         f"<footer>likeness {escape(code_version())}</footer></main>"
         f"<script>{_SCRIPT}</script></body></html>\n"
     )

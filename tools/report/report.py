@@ -11,6 +11,8 @@ from capture.camera import CameraArray
 from capture.progress import Progress, silent
 from capture.session import Session
 from tools.report.calibration import calibration_section
+from tools.report.calibration_gate import gate_box
+from tools.report.calibration_page import calibration_sections
 from tools.report.inputs import ReportInputs, TakeInputs
 from tools.report.overview import layout_section, numbers_section, timing_section
 from tools.report.page import Section, write_page
@@ -87,15 +89,16 @@ def report_for_take(
 
 
 def write_calibration_page(cameras: CameraArray, report: Mapping[str, Any], out: Path) -> Path:
-    """Write the page of a calibration: layout, residuals, coverage, warnings.
+    """Write the page of a calibration: the gate, the array, its uncertainty, every device.
 
     Args:
         cameras: the calibrated array.
-        report: what the calibration says of itself.
-        out: the file.
+        report: what the calibration says of itself; whatever it lacks is left out.
+        out: the file, beside the log that the report names.
     """
     inputs = ReportInputs(title="Calibration", cameras=cameras, told=report)
-    return _write(inputs, out, (calibration_section, layout_section, numbers_section), silent)
+    summary = gate_box(report)
+    return _write(inputs, out, (calibration_sections, numbers_section), silent, summary)
 
 
 def write_scan_page(take: Path, out: Path) -> Path:
@@ -105,13 +108,15 @@ def write_scan_page(take: Path, out: Path) -> Path:
     return _write(inputs, out, (scan_section, layout_section, numbers_section), silent)
 
 
-def _write(inputs: ReportInputs, out: Path, parts: tuple[_Part, ...], progress: Progress) -> Path:
+def _write(
+    inputs: ReportInputs, out: Path, parts: tuple[_Part, ...], progress: Progress, summary: str = ""
+) -> Path:
     inputs = replace(inputs, out=Path(out))
     sections = []
     for done, part in enumerate(parts, start=1):
         sections += part(inputs)
         progress(done, len(parts), "report")
-    write_page(inputs.title, _lead(inputs), sections, Path(out))
+    write_page(inputs.title, _lead(inputs), sections, Path(out), summary=summary)
     return Path(out)
 
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 # Okabe and Ito's palette without its yellow and sky blue, which print too pale for thin lines
 PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#8c6d1f", "#000000", "#e69f00")
 DASHES = ("", "7 3", "2 3", "9 3 2 3")
+MICRO = "\u00b5m"  # micrometres
 LEVELS = {"good": "#1b7f4b", "warn": "#c27c00", "bad": "#b3261e", "none": "#8a8f98"}
 
 

@@ -13,10 +13,11 @@ from typing import Annotated, Any
 
 import tyro
 
+from capture.camera_file import read_cameras
 from capture.progress import Progress
 from capture.take import Take
 from recon.array_solver import CalibrateSettings
-from recon.board import read_board
+from recon.board_body import read_body
 from recon.calibrate import calibrate, report_path
 from tools.report import write_calibration_page
 from tools.verbs.options import Options
@@ -34,6 +35,8 @@ class Arguments(Options):
     """The board's TOML file."""
     out: Path
     """cameras.json to write."""
+    previous: Path | None = None
+    """cameras.json of a previous session of the same array, whose world is kept."""
     settings: Annotated[CalibrateSettings, tyro.conf.arg(name="")] = field(
         default_factory=CalibrateSettings
     )
@@ -42,10 +45,16 @@ class Arguments(Options):
 def run(arguments: Arguments, progress: Progress) -> dict[str, Any]:
     """Calibrate, draw the page, report the residuals."""
     take = Take.open(arguments.take)
-    board = read_board(arguments.board)
-    cameras = calibrate(take, board, arguments.settings, arguments.out, progress=progress)
+    board = read_body(arguments.board)
+    previous = None if arguments.previous is None else read_cameras(arguments.previous)
+    cameras = calibrate(
+        take, board, arguments.settings, arguments.out, previous=previous, progress=progress
+    )
     report = json.loads(report_path(arguments.out).read_text(encoding="utf-8"))
     page = arguments.out.with_suffix(".html")
     write_calibration_page(cameras, report, page)
     plain = {k: v for k, v in report.items() if isinstance(v, str | int | float | bool)}
-    return {"cameras": str(arguments.out), "page": str(page), "count": len(cameras), **plain}
+    return {
+        "cameras": str(arguments.out), "page": str(page), "count": len(cameras), **plain,
+        "gate": report["gate"], "warnings": report["warnings"],
+    }  # fmt: skip

@@ -1,0 +1,1 @@
+"""Drawing calibration boards at true scale, for printers."""

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
+import scipy.sparse
 
 from capture.arrays import Bools, Floats, Ints, check_shape
 from capture.camera import Camera, CameraArray
@@ -22,6 +23,7 @@ from recon.observations import BoardObservations
 LENS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
 _LENS = len(LENS)
 _RIGID = 6
+_OFTEN = 4  # a corner seen less often may not be determined itself, and tells nothing then
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -163,7 +165,11 @@ def array_covariance(
         appendix C (covariance), 9.3 (inner constraints).
     """
     count = len(state.cameras)
-    free = np.unique(observations.corner) if shape is not None else np.zeros(0, np.int64)
+    free = np.zeros(0, np.int64)
+    if shape is not None:
+        seen = np.bincount(observations.corner, minlength=len(state.corners))
+        observations = observations.select(seen[observations.corner] >= _OFTEN)
+        free = np.unique(observations.corner)
     normal = _reduced_normal(state, observations, free)
     null, fixing = _gauge(state, shape, free)
     scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
@@ -192,28 +198,42 @@ def _reduced_normal(state: ArrayState, observations: BoardObservations, free: In
         moved[rows] = camera.project_jacobian(points[rows])
     rigid = moved @ _rigid_basis(points)
     turns = np.stack([pose.rotation for pose in state.array_from_board])[observations.pose]
-    board = moved @ turns
-    place = np.searchsorted(free, observations.corner)
     start = (_LENS + _RIGID) * count
     width = start + 3 * len(free)
-    normal = np.zeros((width, width))
-    for pose in np.unique(observations.pose):
-        rows = np.flatnonzero(observations.pose == pose)
-        block = np.zeros((len(rows), 2, width))
-        at = np.arange(len(rows))[:, None, None]
-        both = np.arange(2)[None, :, None]
-        device = observations.device[rows][:, None, None]
-        block[at, both, _LENS * device + np.arange(_LENS)] = lens[rows]
-        block[at, both, _LENS * count + _RIGID * device + np.arange(_RIGID)] = rigid[rows]
-        if len(free):
-            block[at, both, start + 3 * place[rows][:, None, None] + np.arange(3)] = board[rows]
-        flat = block.reshape(-1, width)
-        own = rigid[rows].reshape(-1, _RIGID)
-        sizes = np.linalg.norm(own, axis=0)
-        unit, _ = np.linalg.qr(own / np.maximum(sizes, 1e-300))
-        flat = flat - unit @ (unit.T @ flat)
-        normal += flat.T @ flat
-    return normal
+    used, pose = np.unique(observations.pose, return_inverse=True)
+    corner = np.searchsorted(free, observations.corner)
+    blocks = [
+        (lens, _LENS * observations.device),
+        (rigid, _LENS * count + _RIGID * observations.device),
+    ]
+    if len(free):
+        blocks.append((moved @ turns, start + 3 * corner))
+    jacobian = _sparse(blocks, width)
+    by_pose = _sparse([(rigid, _RIGID * pose)], _RIGID * len(used))
+    normal: Floats = (jacobian.T @ jacobian).toarray()
+    coupling = (by_pose.T @ jacobian).toarray().reshape(len(used), _RIGID, width)
+    own = np.zeros((len(used), _RIGID, _RIGID))
+    np.add.at(own, pose, rigid.transpose(0, 2, 1) @ rigid)
+    sizes = np.sqrt(np.einsum("pii->pi", own))
+    scaled = own / (sizes[:, :, None] * sizes[:, None, :])
+    coupling /= sizes[:, :, None]
+    for block, across in zip(scaled, coupling, strict=True):
+        normal -= across.T @ np.linalg.solve(block, across)
+    return 0.5 * (normal + normal.T)
+
+
+def _sparse(blocks: list[tuple[Floats, Ints]], width: int) -> scipy.sparse.csr_array:
+    """A matrix (2 M, width) of blocks (M, 2, k) that start at columns (M,)."""
+    rows, columns, values = [], [], []
+    for block, first in blocks:
+        total, _, size = block.shape
+        row = 2 * np.arange(total)[:, None, None] + np.arange(2)[None, :, None]
+        column = first[:, None, None] + np.arange(size)[None, None, :]
+        rows.append(np.broadcast_to(row, block.shape).ravel())
+        columns.append(np.broadcast_to(column, block.shape).ravel())
+        values.append(block.ravel())
+    entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
+    return scipy.sparse.csr_array(entries, shape=(2 * len(blocks[0][0]), width))
 
 
 def _gauge(state: ArrayState, shape: BoardShape | None, free: Ints) -> tuple[Floats, Floats]:

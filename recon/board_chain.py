@@ -19,6 +19,7 @@ from recon.nominal_lenses import LEAST_CORNERS, face_rows, nominal_lenses
 from recon.observations import BoardObservations
 
 _AGREEING = 0.05  # relative poses nearer than this (radians plus fraction of distance) agree
+_EACH = 4  # one corner in so many tells which of two poses is right
 _CAP = 0.1  # a relative pose off by more than this (radians, or fraction of distance) is just wrong
 
 
@@ -170,7 +171,12 @@ def _joined(
             for p in range(len(observations.frames))
             if (p, known) in found and (p, new) in found
         ]
-        body_from_group[new] = body_from_group[known] @ _medoid(options, np.arange(len(options)))[0]
+        best, _ = _medoid(
+            np.stack([option.rotation for option in options]),
+            np.stack([option.translation for option in options]),
+            np.arange(len(options)),
+        )
+        body_from_group[new] = body_from_group[known] @ options[best]
     corners = np.array(shape.corners)
     for face, group in enumerate(groups.tolist()):
         if not shape.placed[face]:
@@ -254,15 +260,12 @@ def _link(observations: BoardObservations, views: list[_View]) -> Links:
     for one in range(count):
         for other in range(one):
             both = sorted(places[one].keys() & places[other].keys())
-            options, owners = [], []
-            for place, pose in enumerate(both):
-                for first in places[one][pose].candidates:
-                    for second in places[other][pose].candidates:
-                        options.append(first @ second.inverse())
-                        owners.append(place)
-            if not options:
+            if not both:
                 continue
-            best, near = _medoid(options, np.array(owners))
+            best, near = _shared_motion(
+                [places[one][pose].candidates for pose in both],
+                [places[other][pose].candidates for pose in both],
+            )
             relative[one, other], relative[other, one] = best, best.inverse()
             sizes = [min(places[one][p].corners, places[other][p].corners) for p in both]
             shared[one, other] = shared[other, one] = len(both)
@@ -293,16 +296,36 @@ def _spanning_tree(
     return parent, order
 
 
-def _medoid(options: list[Pose], owner: Ints) -> tuple[Pose, Bools]:
+def _shared_motion(
+    ones: list[tuple[Pose, ...]], others: list[tuple[Pose, ...]]
+) -> tuple[Pose, Bools]:
+    """The motion one_from_other that most pairs of candidate poses offer, and which pairs do."""
+    pairs = [
+        (place, first, second)
+        for place, (own, theirs) in enumerate(zip(ones, others, strict=True))
+        for first in own
+        for second in theirs
+    ]
+    turns = np.stack([first.rotation for _, first, _ in pairs])
+    shifts = np.stack([first.translation for _, first, _ in pairs])
+    back = np.stack([second.rotation for _, _, second in pairs])
+    from_there = np.stack([second.translation for _, _, second in pairs])
+    turned = turns @ back.transpose(0, 2, 1)
+    moved = shifts - np.einsum("aij,aj->ai", turned, from_there)
+    best, near = _medoid(turned, moved, np.array([place for place, _, _ in pairs]))
+    _, first, second = pairs[best]
+    return first @ second.inverse(), near
+
+
+def _medoid(turns: Floats, shifts: Floats, owner: Ints) -> tuple[int, Bools]:
     """The motion that most owners (O,) offer one near to, and which owners do.
 
     Args:
-        options: motions.
-        owner: (len(options),) whose option each is, from 0, ascending.
+        turns: (A, 3, 3) rotations.
+        shifts: (A, 3) translations, mm.
+        owner: (A,) whose each is, from 0, ascending.
     """
-    turns = np.stack([option.rotation for option in options])
-    shifts = np.stack([option.translation for option in options])
-    trace = np.einsum("aij,bij->ab", turns, turns)
+    trace = turns.reshape(-1, 9) @ turns.reshape(-1, 9).T
     angle = np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0))
     reach = max(float(np.median(np.linalg.norm(shifts, axis=1))), 1e-9)
     gap = np.linalg.norm(shifts[:, None] - shifts[None], axis=2) / reach
@@ -310,7 +333,7 @@ def _medoid(options: list[Pose], owner: Ints) -> tuple[Pose, Bools]:
     starts = np.flatnonzero(np.diff(owner, prepend=-1))
     nearest = np.minimum.reduceat(distance, starts, axis=1)
     best = int(np.argmin(nearest.sum(axis=1)))
-    return options[best], nearest[best] < _AGREEING
+    return best, nearest[best] < _AGREEING
 
 
 def board_poses(
@@ -352,7 +375,7 @@ def _disagreement(
     """Mean capped reprojection error of one board pose over all devices, in image sizes."""
     total = 0.0
     for device in np.unique(observations.device[rows]):
-        mine = rows[observations.device[rows] == device]
+        mine = rows[observations.device[rows] == device][::_EACH]
         miss = (
             cameras[device].project(points[observations.corner[mine]]) - observations.pixels[mine]
         )

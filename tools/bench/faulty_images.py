@@ -96,7 +96,7 @@ IMAGE_FAULTS = (
     ImageFault(
         words="board file with rows and columns exchanged",
         filed=dataclasses.replace(A4_BOARD, squares_x=9, squares_y=12),
-        expected=("12 x 9",),
+        expected=("12 squares a row", "squares_x = 9"),
     ),
     ImageFault(words="nothing wrong", expected=()),
 )

@@ -10,7 +10,7 @@ from capture.arrays import Floats, check_shape
 from capture.camera import CameraArray
 from capture.errors import ShapeError
 from capture.pose import Pose
-from recon.observations import BoardObservations
+from recon.board.observations import BoardObservations
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,9 +21,9 @@ from capture.errors import CameraError, SolveError, raise_all
 from capture.pose import Pose
 from capture.product import replacing
 from recon.array_state import ArrayState
+from recon.board.observations import BoardObservations
 from recon.camera_parts import check_unit, rigid, scaled
 from recon.colmap_files import check_model_files, name_images
-from recon.observations import BoardObservations
 
 _HALF_PIXEL = 0.5
 _PARAMETERS = {  # where fx fy cx cy k1 k2 p1 p2 stand among each model's parameters; None is 0
@@ -48,7 +48,7 @@ class AdjustOptions:
         free_principal_points: principal points (only with free lenses).
         free_cameras: where the devices stand in the array.
         free_board: the board's shape. Nothing fixes its space and the scale then: the result may
-            have moved by them, see `recon.array_gauge`.
+            have moved by them, see `recon.calibration.gauge`.
         iterations: at most this many steps.
         moving: indices of the devices whose place and lens may move while the others are held to
             the last bit; None lets all move.

@@ -13,9 +13,9 @@ from capture.arrays import Bools, Floats, Image
 from capture.camera import Camera
 from capture.errors import TakeError
 from capture.pose import Pose
-from recon.april_grid import AprilGrid
-from recon.board import Board
-from recon.marker_dictionary import marker_cells
+from recon.board.april_grid import AprilGrid
+from recon.board.charuco import Board
+from recon.board.marker_dictionary import marker_cells
 from tools.bench.board_scene import render_board
 
 

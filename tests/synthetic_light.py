@@ -9,10 +9,10 @@ import numpy as np
 
 from capture.arrays import Floats, Image
 from capture.camera import CameraArray
-from recon.board import Board
-from recon.board_body import BoardBody
-from recon.board_spots import BoardSpots, white_spots
-from recon.light_samples import LightSamples
+from recon.board.body import BoardBody
+from recon.board.charuco import Board
+from recon.photometry.board_spots import BoardSpots, white_spots
+from recon.photometry.light_samples import LightSamples
 from tools.bench.board_scene import A4_BOARD, BoardScene, make_state
 
 BIG_BOARD = Board(

@@ -48,9 +48,9 @@ VERBS: dict[str, str] = {
 
 _MODULES = {"import": "tools.verbs.visit", "demo": "tools.verbs.demonstrate"}
 _STAGES = {
-    "calibrate": ("recon.array_solver", "CalibrateSettings"),
-    "photometric": ("recon.photometric_sources", "PhotometricSettings"),
-    "drift": ("recon.array_drift", "DriftSettings"),
+    "calibrate": ("recon.calibration.solver", "CalibrateSettings"),
+    "photometric": ("recon.photometry.sources", "PhotometricSettings"),
+    "drift": ("recon.calibration.drift", "DriftSettings"),
     "recon": ("recon.scan", "ReconSettings"),
     "neutral": ("track.neutral", "NeutralSettings"),
     "landmarks": ("track.landmark_stage", "LandmarkSettings"),

@@ -19,9 +19,9 @@ import numpy as np
 from capture.progress import Progress, silent
 from capture.settings import settings_to_toml
 from capture.take import Take
-from recon.array_solver import CalibrateSettings
-from recon.board import read_board
-from recon.calibrate import calibrate, report_path
+from recon.board.charuco import read_board
+from recon.calibration.solver import CalibrateSettings
+from recon.calibration.stage import calibrate, report_path
 from recon.mesh import write_obj
 from recon.scan import ReconSettings, reconstruct
 from rig.export import export

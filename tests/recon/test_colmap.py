@@ -11,8 +11,8 @@ import pytest
 from capture.camera import Camera, CameraArray
 from capture.errors import CameraError
 from capture.pose import Pose
-from recon.array_gauge import regauged
-from recon.board_shape import BoardShape
+from recon.board.shape import BoardShape
+from recon.calibration.gauge import regauged
 from recon.colmap import (
     AdjustOptions,
     adjust_array,

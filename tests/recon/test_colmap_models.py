@@ -16,7 +16,12 @@ from capture.pose import Pose
 from recon.colmap import read_model, to_colmap, write_model
 from recon.colmap_files import name_images
 from tests.capture.refusals import refusal
-from tests.recon.camera_cases import CLOUD, assert_projects_alike, assert_same, random_array
+from tests.recon.exchange.camera_cases import (
+    CLOUD,
+    assert_projects_alike,
+    assert_same,
+    random_array,
+)
 
 Model = pycolmap.Reconstruction
 

@@ -13,9 +13,9 @@ import pytest
 
 from capture.arrays import Floats
 from capture.errors import InputError, SettingsError
-from recon.april_grid import AprilGrid
-from recon.board import Board, read_board
-from recon.board_body import FlatBoard, ScaleBar, read_body
+from recon.board.april_grid import AprilGrid
+from recon.board.body import FlatBoard, ScaleBar, read_body
+from recon.board.charuco import Board, read_board
 from tools.board_print.board_text import board_caption
 from tools.board_print.pattern import Pattern, bar_pattern, board_pattern, outlines
 from tools.board_print.sheet import PAGES_MM, Sheet, lay_out

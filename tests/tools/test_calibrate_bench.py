@@ -13,8 +13,8 @@ from capture.camera import CameraArray
 from capture.errors import SettingsError, SolveError
 from capture.pose import Pose
 from recon.array_state import ArrayState
-from recon.corners import CornerDetector
-from recon.observations import BoardObservations
+from recon.board.corners import CornerDetector
+from recon.board.observations import BoardObservations
 from tools.bench.bench_rows import Row, RowFile
 from tools.bench.board_arrays import LAYOUTS, device_directions
 from tools.bench.board_images import BoardCamera, Optics

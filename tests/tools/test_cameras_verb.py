@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from capture.camera_file import read_cameras, write_cameras
-from recon.camera_exchange import read_any
-from tests.recon.camera_cases import KALIBR, METASHAPE, assert_same, random_array
+from recon.exchange.cameras import read_any
+from tests.recon.exchange.camera_cases import KALIBR, METASHAPE, assert_same, random_array
 from tools.cli import main
 
 

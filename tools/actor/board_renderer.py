@@ -9,7 +9,7 @@ import numpy as np
 from capture.arrays import Floats32
 from capture.camera import Camera
 from capture.pose import Pose
-from recon.board import Board
+from recon.board.charuco import Board
 from tools.actor.canvas import Canvas
 
 _TEXELS = 64  # of one square's side
@@ -64,8 +64,8 @@ class BoardRenderer:
 
         Args:
             camera: the true projection.
-            world_from_board: where the board is held; board space is that of `recon.board`. Its
-                back shows no pattern.
+            world_from_board: where the board is held; board space is that of
+                `recon.board.charuco`. Its back shows no pattern.
         """
         corners = world_from_board.apply(self._corners)
         outward = -world_from_board.rotation[:, 2]

@@ -14,7 +14,7 @@ from capture.arrays import Floats, Image
 from capture.camera import Camera
 from capture.errors import SettingsError, raise_all
 from capture.pose import Pose
-from recon.board import Board
+from recon.board.charuco import Board
 from tools.actor.board_renderer import BoardRenderer
 from tools.actor.canvas import Canvas
 from tools.actor.model import ActorModel, PosedActor, build_actor, named_weights
@@ -131,8 +131,8 @@ def open_scene(spec: str | Mapping[str, Any]) -> ActorScene:
 
     Args:
         spec: keys `acts` (a list of tables with the fields of `Act`), and optionally `actor`,
-            `board` (the fields of `recon.board.Board`), `seed`, `supersample`; as a mapping, as
-            JSON text, or as the path of a JSON file.
+            `board` (the fields of `recon.board.charuco.Board`), `seed`, `supersample`; as a
+            mapping, as JSON text, or as the path of a JSON file.
 
     Raises:
         SettingsError: naming what does not fit.

@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from recon.array_solver import CalibrateSettings
+from recon.calibration.solver import CalibrateSettings
 from tools.bench.bench_rows import Row, RowFile
 from tools.bench.board_scene import BoardScene
 from tools.bench.calibrate_faults import run_faults, run_healthy, run_image_faults

@@ -15,10 +15,10 @@ import numpy as np
 from capture.arrays import Floats
 from capture.camera import CameraArray
 from capture.pose import Pose
-from recon.array_drift import DriftSettings, check_drift
 from recon.array_state import ArrayState
-from recon.board_shape import BoardShape
-from recon.drift_fit import fit_drift
+from recon.board.shape import BoardShape
+from recon.calibration.drift import DriftSettings, check_drift
+from recon.calibration.drift_fit import fit_drift
 from tools.bench.board_scene import A4_BOARD, BoardScene, make_state, observe
 
 _KINDS = {  # unit motions: 1 um or 1 mdeg

@@ -14,7 +14,7 @@ import numpy as np
 from capture.arrays import Floats, Floats32, Image
 from capture.camera import Camera
 from capture.pose import Pose
-from recon.board import Board
+from recon.board.charuco import Board
 from tools.bench.board_scene import bow_height
 
 _PRINT = 8  # pixels of the print a millimetre

@@ -12,8 +12,8 @@ from capture.arrays import Floats, Image
 from capture.camera import Camera, CameraArray
 from capture.pose import Pose
 from recon.array_state import ArrayState
-from recon.board import Board
-from recon.observations import BoardObservations
+from recon.board.charuco import Board
+from recon.board.observations import BoardObservations
 from tools.bench.board_arrays import board_yaws, device_directions
 
 _PRINT = 8.0  # pixels of the drawn pattern a millimetre

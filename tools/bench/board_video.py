@@ -10,8 +10,8 @@ from capture.arrays import Floats
 from capture.camera import Camera, CameraArray
 from capture.pose import Pose
 from recon.array_state import ArrayState
-from recon.board import Board
-from recon.observations import BoardObservations
+from recon.board.charuco import Board
+from recon.board.observations import BoardObservations
 from tools.bench.board_scene import A4_BOARD, FACING, BoardScene, bent_corners, make_array
 
 _WAVES = np.array([0.7, 1.0, 1.7, 2.6])  # turns a hundred frames

@@ -9,10 +9,10 @@ from collections.abc import Sequence
 from functools import partial
 
 from capture.errors import LikenessError
-from recon.array_alignment import align_to_previous, alignment_problems
-from recon.array_solver import CalibrateSettings, solve_array
-from recon.calibration_report import ReportExtras, calibration_report
-from recon.scale_bar_check import measure_bar
+from recon.calibration.alignment import align_to_previous, alignment_problems
+from recon.calibration.report import ReportExtras, calibration_report
+from recon.calibration.scale_bar import measure_bar
+from recon.calibration.solver import CalibrateSettings, solve_array
 from tools.bench.bench_rows import Row, RowFile
 from tools.bench.calibrate_opponents import failure
 from tools.bench.faulty_images import IMAGE_FAULTS, ImageFault, diagnosis
@@ -50,7 +50,12 @@ def program_says(take: FaultyTake) -> list[str]:
 
 
 def named_right(take: FaultyTake, messages: Sequence[str]) -> bool:
-    """Whether the messages name every guilty device and no other, or the board file's fault."""
+    """Whether the messages name every guilty device and no other, or the board file's fault.
+
+    Of a healthy take, whether there are none.
+    """
+    if not take.fault:
+        return not messages
     text = " ".join(messages)
     named = set(re.findall(r"\bcam\d+\b", text))
     wanted = next((words for key, words in _WORDS_OF.items() if take.fault.startswith(key)), ())

@@ -9,10 +9,10 @@ import numpy as np
 from capture.arrays import Floats, Image, Ints
 from capture.camera import CameraArray
 from capture.pose import Pose
-from recon.array_solver import CalibrateSettings, solve_array
 from recon.array_state import ArrayState
-from recon.corners import CornerDetector
-from recon.observations import BoardObservations
+from recon.board.corners import CornerDetector
+from recon.board.observations import BoardObservations
+from recon.calibration.solver import CalibrateSettings, solve_array
 from tools.bench.bench_rows import Row, RowFile
 from tools.bench.board_images import BoardCamera
 from tools.bench.board_scene import A4_BOARD, BoardScene, make_state

@@ -13,10 +13,10 @@ from capture.arrays import Bools, Floats
 from capture.camera import Camera, CameraArray
 from capture.errors import LikenessError, SolveError
 from capture.pose import Pose
-from recon.array_solver import CalibrateSettings, solve_array
-from recon.board_chain import initial_state
+from recon.board.observations import BoardObservations
+from recon.calibration.chain import initial_state
+from recon.calibration.solver import CalibrateSettings, solve_array
 from recon.colmap import AdjustOptions, adjust_array
-from recon.observations import BoardObservations
 
 _LEAST_CORNERS = 8  # of a view that OpenCV is given
 _MILLI = 0.001

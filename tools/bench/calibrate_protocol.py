@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 
 from capture.errors import LikenessError
-from recon.array_solver import ArraySolution, CalibrateSettings, solve_array
+from recon.calibration.solver import ArraySolution, CalibrateSettings, solve_array
 from tools.bench.bench_rows import Row, RowFile
 from tools.bench.board_scene import A4_BOARD, BoardScene, make_state, observe
 from tools.bench.calibrate_opponents import Opponent, failure

@@ -8,7 +8,7 @@ import numpy as np
 
 from capture.arrays import Floats
 from capture.camera import CameraArray
-from recon.array_covariance import ArrayCovariance
+from recon.calibration.covariance import ArrayCovariance
 from tools.bench.board_scene import face_points, triangulate, triangulation_error
 from track.rigid import fit_similarity
 

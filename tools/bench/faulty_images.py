@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from capture.arrays import Image
-from recon.board import Board
-from recon.board_body import BoardBody
-from recon.board_diagnosis import explain_blind, merged_words
-from recon.board_sightings import observe_board
-from recon.corners import CornerLimits
+from recon.board.body import BoardBody
+from recon.board.charuco import Board
+from recon.board.corners import CornerLimits
+from recon.board.diagnosis import explain_blind, merged_words
+from recon.board.sightings import observe_board
 from tools.bench.board_images import BoardCamera
 from tools.bench.board_scene import A4_BOARD, BoardScene, make_state
 
@@ -25,7 +25,7 @@ _ODD_ONE = 2
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ImageTake:
-    """A take in memory, as `recon.corners.BoardTake` wants it.
+    """A take in memory, as `recon.board.corners.BoardTake` wants it.
 
     Attributes:
         device_names: names of the devices.

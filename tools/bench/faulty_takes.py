@@ -9,9 +9,9 @@ import numpy as np
 
 from capture.camera import CameraArray
 from recon.array_state import ArrayState
-from recon.board import Board
-from recon.board_sightings import BarSightings
-from recon.observations import BoardObservations
+from recon.board.charuco import Board
+from recon.board.observations import BoardObservations
+from recon.board.sightings import BarSightings
 from tools.bench.board_scene import A4_BOARD, BoardScene, observe
 from tools.bench.board_video import (
     delay_device,

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 
-from recon.board_body import FlatBoard, ScaleBar
-from recon.board_table import sizes_mm
+from recon.board.body import FlatBoard, ScaleBar
+from recon.board.table import sizes_mm
 
 Value = str | bool | int | float
 

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from capture.arrays import Bools, Floats, Ints
-from recon.april_grid import AprilGrid
-from recon.board import Board
-from recon.board_body import FlatBoard, ScaleBar
-from recon.marker_dictionary import marker_cells
+from recon.board.april_grid import AprilGrid
+from recon.board.body import FlatBoard, ScaleBar
+from recon.board.charuco import Board
+from recon.board.marker_dictionary import marker_cells
 
 _BAR_GAP = 0.5  # white between the two markers of a scale bar, over their side
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from recon.gate_levels import GateSettings
+from recon.calibration.gate_levels import GateSettings
 from tools.report.calibration_keys import count_of, mapping_of, number_of, rows_of
 from tools.report.page import Verdict, facts
 from tools.report.svg import MICRO, escape, number

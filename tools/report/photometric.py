@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from capture.arrays import Floats
-from recon.photometric_words import GAIN_OFF, WEAK_SIGMA, cell_middles, gain_ratios
-from recon.photometry import DevicePhotometry, PhotometricModel
+from recon.photometry.model import DevicePhotometry, PhotometricModel
+from recon.photometry.words import GAIN_OFF, WEAK_SIGMA, cell_middles, gain_ratios
 from tools.report.charts import Labels, Series, bar_chart, colour_scale, line_chart
 from tools.report.page import Section, Verdict, facts, figure, gallery, table, write_page
 from tools.report.picture import jpeg_tag, sequential, stops

@@ -15,9 +15,9 @@ from typing import Any, Literal
 from capture.errors import InputError
 from capture.product import replacing
 from capture.progress import Progress
-from recon.april_grid import AprilGrid
-from recon.board import Board
-from recon.board_body import BoardBody, FlatBoard, read_body
+from recon.board.april_grid import AprilGrid
+from recon.board.body import BoardBody, FlatBoard, read_body
+from recon.board.charuco import Board
 from tools.board_print.board_text import bar_caption, board_caption, board_toml
 from tools.board_print.pattern import bar_pattern, board_pattern
 from tools.board_print.sheet import Sheet, lay_out

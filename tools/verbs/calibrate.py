@@ -16,9 +16,9 @@ import tyro
 from capture.camera_file import read_cameras
 from capture.progress import Progress
 from capture.take import Take
-from recon.array_solver import CalibrateSettings
-from recon.board_body import read_body
-from recon.calibrate import calibrate, report_path
+from recon.board.body import read_body
+from recon.calibration.solver import CalibrateSettings
+from recon.calibration.stage import calibrate, report_path
 from tools.report import write_calibration_page
 from tools.verbs.options import Options
 

@@ -16,7 +16,8 @@ import tyro
 from capture.camera import Camera, CameraArray
 from capture.errors import CameraError
 from capture.progress import Progress
-from recon.camera_exchange import (
+from recon.camera_parts import TERMS, check_unit, scaled
+from recon.exchange.cameras import (
     FORMATS,
     CameraFormat,
     kind_of_suffix,
@@ -25,7 +26,6 @@ from recon.camera_exchange import (
     recognise,
     write_any,
 )
-from recon.camera_parts import TERMS, check_unit, scaled
 from tools.verbs.options import Options
 
 Kind = Literal["likeness", "colmap", "colmap-text", "opencv", "metashape", "kalibr"]

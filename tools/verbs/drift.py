@@ -22,14 +22,14 @@ from capture.errors import CameraError, InputError, SolveError
 from capture.product import replacing
 from capture.progress import Progress
 from capture.take import Take
-from recon.array_drift import DriftSettings, check_drift, resolve_devices
-from recon.board_body import read_body
-from recon.board_shape import BoardShape
-from recon.board_sightings import observe_board
-from recon.corner_cache import CornerCache
-from recon.corners import CornerLimits
-from recon.drift_report import DriftReport
-from recon.observations import BoardObservations
+from recon.board.body import read_body
+from recon.board.corner_cache import CornerCache
+from recon.board.corners import CornerLimits
+from recon.board.observations import BoardObservations
+from recon.board.shape import BoardShape
+from recon.board.sightings import observe_board
+from recon.calibration.drift import DriftSettings, check_drift, resolve_devices
+from recon.calibration.drift_report import DriftReport
 from tools.report.drift import write_drift_page
 from tools.verbs.options import Options
 

@@ -19,9 +19,9 @@ import tyro
 from capture.camera_file import read_cameras
 from capture.progress import Progress
 from capture.take import Take
-from recon.board_body import read_body
-from recon.photometric_sources import LightSources, PhotometricSettings
-from recon.photometric_stage import calibrate_photometry
+from recon.board.body import read_body
+from recon.photometry.sources import LightSources, PhotometricSettings
+from recon.photometry.stage import calibrate_photometry
 from tools.report.photometric import write_photometric_page
 from tools.verbs.options import Options
 

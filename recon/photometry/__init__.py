@@ -1,0 +1,1 @@
+"""Vignetting, gain and black level of the devices."""

@@ -21,6 +21,7 @@ _CONVERGING = 0.02  # least eigenvalue of the mean projector across the axes
 _BALL = 0.12  # radius of the compared volume over the working distance
 _CHANGED_PX, _CHANGED_TIMES = 0.5, 5.0  # a device is named beyond both
 _SCALED = 5e-4  # a change of scale worth a word
+_SURE = 4.0  # if it is beyond so many standard deviations
 _SAME_PLACE = 0.25  # of the distance between two places: near enough to be there
 _LENS_MARGIN = 3.0  # one pairing of lenses must be this many times nearer than the other
 
@@ -32,6 +33,7 @@ class Alignment:
     Attributes:
         world_from_array: rigid motion of the found array's space into the previous world.
         scale: lengths found over lengths then, of the devices that kept their places.
+        scale_sigma: its standard deviation, by leaving out one device after the other.
         moved: by name, how far the device's centre moved (mm) and by what angle it turned (deg),
             after the motion and the scale are taken out; an exchanged device is compared with the
             place it has taken.
@@ -47,6 +49,7 @@ class Alignment:
 
     world_from_array: Pose
     scale: float
+    scale_sigma: float
     moved: dict[str, tuple[float, float]]
     effect_px: dict[str, float]
     swapped: tuple[tuple[str, ...], ...]
@@ -96,6 +99,7 @@ def align_to_previous(found: CameraArray, previous: CameraArray) -> Alignment:
     return Alignment(
         world_from_array=plain,
         scale=scale,
+        scale_sigma=_scale_sigma(now, then, kept),
         moved={n: _change(a, b) for n, a, b in zip(names, taken, goal, strict=True)},
         effect_px={n: _effect(a, b, volume) for n, a, b in zip(names, taken, goal, strict=True)},
         swapped=tuple(tuple(names[index] for index in cycle) for cycle in cycles),
@@ -114,7 +118,7 @@ def alignment_problems(alignment: Alignment, square_mm: float | None = None) -> 
     """
     lines = []
     off = alignment.scale - 1.0
-    if abs(off) > _SCALED:
+    if abs(off) > max(_SCALED, _SURE * alignment.scale_sigma):
         way = "further" if off > 0 else "less far"
         ask = "is the size of the board in its file right?"
         if square_mm is not None:
@@ -204,6 +208,21 @@ def _exact_scale(now: Sequence[Camera], then: Sequence[Camera], kept: Bools, rou
     one, other = _centres(now)[kept], _centres(then)[kept]
     spread = [np.sqrt(((x - x.mean(axis=0)) ** 2).sum()) for x in (one, other)]
     return float(spread[0] / spread[1]) if spread[1] > 0 else rough
+
+
+def _scale_sigma(now: Sequence[Camera], then: Sequence[Camera], kept: Bools) -> float:
+    """Standard deviation of the scale; infinity where too few devices kept their places.
+
+    References:
+        Efron 1979, the jackknife.
+    """
+    places = np.flatnonzero(kept)
+    if len(places) < _FEWEST:
+        return float("inf")
+    without = np.array(
+        [_exact_scale(now, then, kept & (np.arange(len(kept)) != one), 1.0) for one in places]
+    )
+    return float(np.sqrt((len(places) - 1) * np.mean((without - without.mean()) ** 2)))
 
 
 def _points(cameras: Sequence[Camera], scale: float, reach: float) -> Floats:

@@ -23,7 +23,7 @@ from capture.product import replacing
 from recon.array_state import ArrayState
 from recon.board.observations import BoardObservations
 from recon.camera_parts import check_unit, rigid, scaled
-from recon.colmap_files import check_model_files, name_images
+from recon.colmap_files import check_model_files, check_replaceable, name_images
 
 _HALF_PIXEL = 0.5
 _PARAMETERS = {  # where fx fy cx cy k1 k2 p1 p2 stand among each model's parameters; None is 0
@@ -257,8 +257,13 @@ def write_model(
         cameras: the array.
         text: .txt files rather than .bin.
         unit_mm: millimetres of the model's unit.
+
+    Raises:
+        CameraError: when the folder holds anything but a COLMAP model.
     """
     check_unit(unit_mm)
+    folder = Path(folder).resolve()  # "." has no name to replace
+    check_replaceable(folder)
     cameras = scaled(cameras, 1.0 / unit_mm)
     origin = cameras[0].camera_from_world
     with _vendor("writing a COLMAP model"):

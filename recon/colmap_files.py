@@ -19,6 +19,8 @@ _PARAMETERS = (3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16)  # by COLMAP's number of t
 _POSE = 7 * 8  # a quaternion and a translation
 _POINT_LEAST = 8 + 3 * 8 + 3 + 8 + 8  # a point in space without a track
 _TEXT_LIMIT = 1 << 30
+_SHOWN = 4  # names that a message lists
+_IMAGE_FIELDS = 10  # of a line of images.txt: number, pose, camera, name
 
 
 def check_model_files(folder: Path) -> None:
@@ -51,11 +53,35 @@ def check_model_files(folder: Path) -> None:
                 _walk(path, walk)
             elif path.stat().st_size > _TEXT_LIMIT:
                 raise ValueError("larger than 1 GiB")
+            elif name == "images":
+                _check_image_names(path)
         except (struct.error, ValueError) as error:
             problems.append(f"{path.name}: not readable as a COLMAP model: {error}")
         except OSError as error:
             problems.append(f"{path.name}: {error.strerror or error}")
     raise_all(str(folder), problems, CameraError)
+
+
+def check_replaceable(folder: Path) -> None:
+    """Refuse to replace a folder that holds more than the files of a COLMAP model.
+
+    Raises:
+        CameraError: naming the folder and what it holds.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        return
+    known = {f"{name}{suffix}" for name in _WALKS for suffix in (".bin", ".txt")}
+    try:
+        others = sorted({entry.name for entry in folder.iterdir()} - known)
+    except OSError as error:
+        raise CameraError(f"{folder}: not readable: {error.strerror or error}") from error
+    if others:
+        more = " ..." if len(others) > _SHOWN else ""
+        raise CameraError(
+            f"{folder}: holds {', '.join(others[:_SHOWN])}{more}, which a model in its place "
+            f"would delete; choose a folder that does not exist, as {folder / 'sparse'}"
+        )
 
 
 def name_images(
@@ -93,6 +119,21 @@ def name_images(
         CameraError,
     )
     return names
+
+
+def _check_image_names(path: Path) -> None:
+    """Refuse names with spaces in images.txt: COLMAP cuts them short without a word."""
+    with path.open(encoding="utf-8", errors="replace") as lines:
+        for line in lines:
+            words = line.split(maxsplit=_IMAGE_FIELDS - 1)
+            if not words or words[0].startswith("#"):
+                continue
+            if len(words) == _IMAGE_FIELDS and len(words[-1].split()) > 1:
+                raise ValueError(
+                    f"the image name {words[-1].strip()!r} has spaces, where COLMAP cuts it in "
+                    "text files; rename the images and their folders"
+                )
+            next(lines, None)  # the points seen in that image
 
 
 def _tells_apart(names: Sequence[str], sensors: Sequence[int]) -> bool:

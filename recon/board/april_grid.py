@@ -44,6 +44,8 @@ from recon.board.marker_dictionary import cut_dictionary, dictionary_problems
 
 KALIBR, OPENCV = "kalibr", "opencv"
 _LAYOUTS = (KALIBR, OPENCV)
+_WIDEST_BORDER = 8  # cells
+_LEAST_GAP = 0.05  # of a tag: below it the ratio was written instead
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,6 +88,13 @@ class AprilGrid:
             value = getattr(self, key)
             if not (math.isfinite(value) and value > 0):
                 problems.append(f"{key}: must be above 0 mm, found {value}")
+        if self.border_bits > _WIDEST_BORDER:
+            problems.append(f"border_bits: at most {_WIDEST_BORDER}, found {self.border_bits}")
+        if 0 < self.gap_mm < _LEAST_GAP * self.tag_mm:
+            problems.append(
+                f"gap_mm: less than {_LEAST_GAP:g} of tag_mm = {self.tag_mm}, found {self.gap_mm}; "
+                f"it is in mm, not Kalibr's ratio tagSpacing: {self.gap_mm * self.tag_mm:g} perhaps"
+            )
         if self.gap_mm > self.tag_mm:
             problems.append(
                 f"gap_mm: must not be above tag_mm = {self.tag_mm}, found {self.gap_mm}; "

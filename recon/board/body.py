@@ -50,6 +50,8 @@ _KINDS: dict[str, type[FlatBoard]] = {"charuco": Board, "aprilgrid": AprilGrid}
 _TABLES = ("board", "boards", "print", "scale_bar")
 _FACE_KEYS = ("name", "body_from_board", "print")
 _PLACE_KEYS = ("rotation_deg", "translation_mm")
+_ONE_OF_MANY = "only a board of several, under [[boards]], has it"
+_FARTHEST = 1e6  # mm, and degrees: beyond it a place on a body is a slip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,7 +87,7 @@ class ScaleBar:
         if not problems:
             for marker in sorted(self.markers):
                 need = range(marker, marker + 1)
-                problems += dictionary_problems(self.dictionary, need, "this end of the bar")[:1]
+                problems += dictionary_problems(self.dictionary, need, "the ends of the bar")[:1]
         raise_all("scale_bar", list(dict.fromkeys(problems)), SettingsError)
 
     def marker_corners_mm(self) -> Floats:
@@ -243,8 +245,12 @@ def _face_tables(path: Path, document: Mapping[str, Any]) -> list[tuple[str, str
             raise SettingsError(
                 f"{path}: expected a table [board], found {sorted(document) or 'nothing'}"
             )
-        apart = [key for key in _FACE_KEYS if key in table]
-        raise_all(f"{path}: [board]", unknown(dict.fromkeys(apart), (), "key"), SettingsError)
+        apart = [
+            f"{key}: {'the table [print] stands by itself' if key == 'print' else _ONE_OF_MANY}"
+            for key in _FACE_KEYS
+            if key in table
+        ]
+        raise_all(f"{path}: [board]", apart, SettingsError)
         printed = {"print": document["print"]} if "print" in document else {}
         return [("[board]", "board", {**table, **printed})]
     if "board" in document or "print" in document:
@@ -302,7 +308,10 @@ def _place(table: Any, wrong: list[str]) -> Pose | None:
         if _are_numbers(value, 3):
             vectors.append(np.array(value, dtype=np.float64))
         else:
-            found.append(f"body_from_board: {key}: expected three numbers, found {value!r}")
+            found.append(
+                f"body_from_board: {key}: expected three numbers up to {_FARTHEST:g}, "
+                f"found {value!r}"
+            )
     wrong += found
     return None if found else Pose.from_rotation_vector(np.radians(vectors[0]), vectors[1])
 
@@ -335,6 +344,7 @@ def _are_numbers(value: Any, count: int) -> bool:
         isinstance(value, list)
         and len(value) == count
         and all(
-            type(number) in (int, float) and math.isfinite(float(str(number))) for number in value
+            type(number) in (int, float) and abs(float(str(number))) <= _FARTHEST
+            for number in value
         )
     )

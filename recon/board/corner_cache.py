@@ -111,7 +111,7 @@ class CornerCache:
             with replacing(self._path(device, frame)) as partial:
                 partial.write_text(f"{seal}\n{text}", encoding="ascii")
         except OSError as error:
-            self.fault = f"{self.folder}: corners cannot be kept: {error.strerror or error}"
+            self.fault = f"{self.folder}: {error.strerror or error}"
 
     def _path(self, device: str, frame: int) -> Path:
         return self.folder / device / f"{frame:06d}.json"

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from capture.arrays import Image
+from capture.errors import TakeError, raise_all
 from recon.board.april_grid import AprilGrid
 from recon.board.body import BoardBody, FlatBoard
 from recon.board.charuco import Board
@@ -31,6 +32,7 @@ _MORE = 1.2  # another board must explain so many times the markers that the fil
 _BENT = 0.25  # of the corners' distance: further off than this from a flat board is wrong
 _FLAT_SHARE = 0.7  # of the corners of a view must be right
 _VIEWS = 8  # of a device, that are tried for flatness
+_SELDOM, _HALF = 4, 0.5  # views, and share of frames, below which a device hardly sees the board
 _AS_FILED = "as filed"
 
 _Found = Mapping[MarkerKind, MarkerSet]
@@ -50,6 +52,10 @@ def explain_blind(take: BoardTake, body: BoardBody, sightings: BoardSightings) -
 
     Returns:
         By device, words that do not name it.
+
+    Raises:
+        TakeError: when every device found corners all the same, and all agree on what is wrong
+            with the board file: an array solved with it would be wrong without a sign.
     """
     blind = [name for name in take.device_names if _is_blind(name, body, sightings)]
     examiner = _Examiner(take, body, sightings)
@@ -57,8 +63,17 @@ def explain_blind(take: BoardTake, body: BoardBody, sightings: BoardSightings) -
         places = np.linspace(0, len(blind) - 1, _FIRST).round().astype(int).tolist()
         first = {_of_file(examiner.look(blind[place])) for place in places}
         if len(first) == 1 and "" not in first:
-            return examiner.named(dict.fromkeys(blind, first.pop()))
-    return examiner.named({name: examiner.look(name) for name in blind})
+            return _unless_found(examiner.named(dict.fromkeys(blind, first.pop())), sightings)
+    return _unless_found(examiner.named({name: examiner.look(name) for name in blind}), sightings)
+
+
+def _unless_found(words: dict[str, str], sightings: BoardSightings) -> dict[str, str]:
+    """The words; refused when corners were found of a board that is not the file's."""
+    agree = len(words) == len(sightings.tally) and len(set(words.values())) == 1
+    if agree and all(map(_of_file, words.values())) and all(map(_found, sightings.tally.values())):
+        lines = merged_words(words, len(words))
+        raise_all("the board is not as its file says", lines, TakeError)
+    return words
 
 
 def merged_words(words: Mapping[str, str], devices: int) -> list[str]:
@@ -87,6 +102,7 @@ def _is_blind(name: str, body: BoardBody, sightings: BoardSightings) -> bool:
         shares[device] = _found(counts) / max(frames, 1)
     usual = float(np.quantile(list(shares.values()), 0.75))
     few = shares[name] == 0.0 or shares[name] < _FEW * usual
+    few = few or (_found(sightings.tally[name]) < _SELDOM and shares[name] < _HALF)
     return few or _is_scattered(name, body, sightings.every)
 
 
@@ -147,6 +163,11 @@ class _Examiner:
             )
         whys = Counter(why for image in images if (why := self._misfit(image)))
         few = ", ".join(f"{n} {reason}" for reason, n in counts.items() if n and reason != LOST)
+        if not whys and _found(counts) and _is_scattered(name, self._body, self._sightings.every):
+            return (
+                "finds corners, but not where the board file has them: compare its kind and all "
+                "its sizes (squares and markers, tags and gaps) with the board"
+            )
         if not whys:
             return (
                 f"no board in {len(images)} images looked at, plain or mirrored, of any marker "

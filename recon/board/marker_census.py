@@ -44,7 +44,7 @@ class MarkerKind:
         """The smallest dictionary of the family that holds a marker id."""
         sizes = {name: _size(name) for name in _members(self.family)}
         fitting = [name for name, size in sizes.items() if size > highest]
-        return min(fitting or sizes, key=lambda name: (sizes[name], name))
+        return min(fitting or sizes, key=lambda name: (sizes[name], name.swapcase()))
 
 
 @dataclass(frozen=True, eq=False)

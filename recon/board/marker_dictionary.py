@@ -47,6 +47,8 @@ def dictionary_problems(name: str, ids: range, what: str) -> list[str]:
     have = len(_whole(name).bytesList)
     if ids.stop <= have:
         return []
+    if ids.stop == ids.start + 1:
+        return [f"dictionary: {what} need marker {ids.start}, {name} has 0 to {have - 1}"]
     since = f" from id {ids.start} on" if ids.start else ""
     return [
         f"dictionary: {what} need {ids.stop - ids.start} markers{since}, {name} has {have}; "

@@ -28,7 +28,7 @@ class TakeDevices:
         """All devices but these.
 
         Raises:
-            SettingsError: naming a device that the take does not have.
+            SettingsError: naming a device that the take does not have, or when none is left.
         """
         for name in left_out:
             if name not in take.device_names:
@@ -36,7 +36,10 @@ class TakeDevices:
                     f"leave_out: the take has no device {name!r}; "
                     f"{known_hint(name, take.device_names)}"
                 )
-        return cls(take, tuple(name for name in take.device_names if name not in left_out))
+        left = tuple(name for name in take.device_names if name not in left_out)
+        if not left:
+            raise SettingsError("leave_out: names every device of the take; leave some in")
+        return cls(take, left)
 
     @property
     def frames(self) -> tuple[int, ...]:

@@ -53,10 +53,12 @@ def check_views(
             )
     lines = merged_words(said, len(views))
     if poses < least_poses and len(said) < len(views):
+        frames = [sum(counts.values()) for counts in (tally or {}).values()]
         problems.insert(
             0,
-            f"the board was used at {poses} poses of {len(observations.frames)}; "
-            f"at least {least_poses} are needed, 15 to 40 are good",
+            f"the board was used at {poses} poses"
+            + (f" in {max(frames)} frames" if frames else "")
+            + f"; at least {least_poses} are needed, 15 to 40 are good",
         )
     problems += lines
     raise_all("devices saw too little of the board", problems, TakeError)

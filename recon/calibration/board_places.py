@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +14,7 @@ from capture.pose import Pose
 from recon.board.observations import BoardObservations
 from recon.board.shape import BoardShape
 from recon.calibration.chain import board_poses
+from recon.calibration.view_poses import rigid_columns
 
 _STEPS = 20
 _STOP = 1e-9  # radians and mm
@@ -37,7 +39,10 @@ class BoardPlace:
 
 
 def place_boards(
-    observations: BoardObservations, shape: BoardShape, cameras: CameraArray
+    observations: BoardObservations,
+    shape: BoardShape,
+    cameras: CameraArray,
+    starts: Sequence[Pose] | None = None,
 ) -> list[BoardPlace]:
     """Find the board at every pose that the cameras can tell, the cameras held as they are.
 
@@ -48,6 +53,7 @@ def place_boards(
         observations: corner sightings, of the devices of `cameras`, in their order.
         shape: the board's corners, every face of it placed.
         cameras: calibrated.
+        starts: world_from_board near each pose, where that is known: refined instead.
 
     References:
         Triggs et al. 2000, section 4 (robust Gauss-Newton).
@@ -59,7 +65,7 @@ def place_boards(
         )
     corners = shape.corners
     found = []
-    starts = board_poses(observations, shape, cameras)
+    starts = board_poses(observations, shape, cameras) if starts is None else starts
     for pose, frame in enumerate(observations.frames):
         rows = np.flatnonzero(observations.pose == pose)
         if not len(rows):
@@ -117,11 +123,7 @@ def _refined(
         for index in np.unique(device):
             mine = device == index
             by_point = cameras[int(index)].project_jacobian(points[mine])
-            arm = points[mine] - middle
-            turn = np.zeros((len(arm), 3, 3))  # d (w x arm) / d w
-            turn[:, 0, 1], turn[:, 0, 2], turn[:, 1, 2] = arm[:, 2], -arm[:, 1], arm[:, 0]
-            turn -= turn.transpose(0, 2, 1)
-            slope[mine, :, :3], slope[mine, :, 3:] = by_point @ turn, by_point
+            slope[mine] = rigid_columns(points[mine] - middle, by_point)
         misses = _misses(observations, rows, corners, cameras, pose)
         good = np.isfinite(misses).all(axis=1)
         weight = 1.0 / (1.0 + (misses[good] ** 2).sum(axis=1) / _LOSS_PX**2)

@@ -15,7 +15,8 @@ from recon.calibration.board_places import place_boards
 from recon.calibration.solver import ArraySolution, CalibrateSettings
 from recon.calibration.world import ArrayWorld, world_from_board_pose
 
-_REFUSED = ("stands where", "apart than in the previous session")
+_OTHER_SIZE = 5e-3  # a scale further off refuses; arrays of three or four differ by up to 0.2 %
+_EXCHANGED, _SCALED = "stands where", "apart than in the previous session"
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,12 +50,14 @@ def choose_world(
 
     Raises:
         TakeError: when no usable view shows the board at the frame named; when devices have been
-            exchanged since the previous session, or the whole array has another size.
+            exchanged since the previous session, or the whole array has another size by more than
+            0.5 %. A lesser change of size is told.
     """
     if previous is not None:
         alignment = align_to_previous(solution.state.cameras, previous)
         lines = alignment_problems(alignment, square_mm)
-        grave = [line for line in lines if any(words in line for words in _REFUSED)]
+        other_size = abs(alignment.scale - 1.0) > _OTHER_SIZE
+        grave = [line for line in lines if _EXCHANGED in line or (other_size and _SCALED in line)]
         raise_all("the array is not that of the previous session", grave, TakeError)
         world = ArrayWorld(
             alignment.world_from_array, "that of the previous session", "that of the same"

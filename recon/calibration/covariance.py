@@ -23,6 +23,8 @@ from recon.board.shape import BoardShape
 LENS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
 _LENS = len(LENS)
 _RIGID = 6
+_RANK = 1e-13  # an eigenvalue below this part of the largest is rounding
+_LITTLE = 1e-10  # of what a parameter would tell if the board poses were known
 _OFTEN = 4  # a corner seen less often may not be determined itself, and tells nothing then
 
 
@@ -164,19 +166,24 @@ def array_covariance(
         Triggs et al. 2000, Bundle Adjustment - A Modern Synthesis, section 6.1 (elimination), 8 and
         appendix C (covariance), 9.3 (inner constraints).
     """
-    count = len(state.cameras)
     free = np.zeros(0, np.int64)
     if shape is not None:
         seen = np.bincount(observations.corner, minlength=len(state.corners))
         observations = observations.select(seen[observations.corner] >= _OFTEN)
         free = np.unique(observations.corner)
-    normal = _reduced_normal(state, observations, free)
+        if not len(free):
+            return None
+    normal, before = _reduced_normal(state, observations, free)
     null, fixing = _gauge(state, shape, free)
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    weight = fixing * np.linalg.norm(normal * scale[:, None] * scale[None], 2) ** 0.5
-    scaled = normal * scale[:, None] * scale[None] + weight.T @ weight
-    values, vectors = scipy.linalg.eigh(scaled)
-    if not values[0] > 1e-13 * values[-1] or count < 1:
+    # The place of a lone device goes with the board poses: nothing is left to scale it by.
+    size = np.maximum(np.diag(normal), _LITTLE * before)
+    if not size.min() > 0.0:  # no corner depends on it
+        return None
+    scale = 1.0 / np.sqrt(size)
+    loose, _ = np.linalg.qr(null / scale[:, None])
+    scaled = normal * scale[:, None] * scale[None]
+    values, vectors = scipy.linalg.eigh(scaled + np.trace(scaled) * (loose @ loose.T))
+    if not values[0] > _RANK * values[-1]:
         return None
     root = scale[:, None] * (vectors / np.sqrt(values))
     # Inner constraints: no part of what is left moves along the gauge.
@@ -187,8 +194,10 @@ def array_covariance(
     )  # fmt: skip
 
 
-def _reduced_normal(state: ArrayState, observations: BoardObservations, free: Ints) -> Floats:
-    """Normal matrix of lenses, devices and free corners, the board poses eliminated."""
+def _reduced_normal(
+    state: ArrayState, observations: BoardObservations, free: Ints
+) -> tuple[Floats, Floats]:
+    """Normal matrix of lenses, devices, free corners without the board poses; its diagonal with."""
     count, total = len(state.cameras), len(observations)
     points = state.points(observations)
     lens, moved = np.zeros((total, 2, _LENS)), np.zeros((total, 2, 3))
@@ -211,15 +220,18 @@ def _reduced_normal(state: ArrayState, observations: BoardObservations, free: In
     jacobian = _sparse(blocks, width)
     by_pose = _sparse([(rigid, _RIGID * pose)], _RIGID * len(used))
     normal: Floats = (jacobian.T @ jacobian).toarray()
+    before = np.diag(normal).copy()
     coupling = (by_pose.T @ jacobian).toarray().reshape(len(used), _RIGID, width)
     own = np.zeros((len(used), _RIGID, _RIGID))
     np.add.at(own, pose, rigid.transpose(0, 2, 1) @ rigid)
     sizes = np.sqrt(np.einsum("pii->pi", own))
-    scaled = own / (sizes[:, :, None] * sizes[:, None, :])
-    coupling /= sizes[:, :, None]
-    for block, across in zip(scaled, coupling, strict=True):
-        normal -= across.T @ np.linalg.solve(block, across)
-    return 0.5 * (normal + normal.T)
+    values, axes = np.linalg.eigh(own / (sizes[:, :, None] * sizes[:, None, :]))
+    known = values > _RANK * values[:, -1:]  # one or two corners leave ways in which a pose is free
+    across = axes * np.where(known, 1.0 / np.sqrt(np.where(known, values, 1.0)), 0.0)[:, None, :]
+    told = across.transpose(0, 2, 1) @ (coupling / sizes[:, :, None])
+    told = told.reshape(-1, width)
+    normal -= told.T @ told
+    return 0.5 * (normal + normal.T), before
 
 
 def _sparse(blocks: list[tuple[Floats, Ints]], width: int) -> scipy.sparse.csr_array:

@@ -30,6 +30,7 @@ from recon.colmap import AdjustOptions, adjust_array
 __all__ = ["DriftSettings", "check_drift", "resolve_devices"]
 
 _FOCAL = 6  # place of the focal length in a motion
+_SAME_PLACE = 0.1  # radians, or of the way moved, by which a device stands beside another's place
 _ALONG, _FEW = 0.98, 3.0  # share of a shift that is along the axis; deviations that are few
 
 
@@ -159,9 +160,7 @@ def _device(
     own = fit.observations.select(rows)
     points = system.state.array_state().points(own)
     misses = [one.project(points) - own.pixels for one in (camera, moved_camera(camera, whole))]
-    before, after = (
-        float(np.sqrt(np.nanmean(miss**2))) if len(own) else float("nan") for miss in misses
-    )
+    before, after = (_rms(miss) for miss in misses)
     shift, shift_sigma = _size(motion[3:6], covariance[3:6, 3:6])
     turn, turn_sigma = _size(motion[:3], covariance[:3, :3])
     verdict: DeviceVerdict = "still"
@@ -177,7 +176,13 @@ def _device(
             verdict = "lens" if fit.lens[index] else "moved"
         remark = device_remark(1e3 * shift_sigma, after, float(fit.sigma_px[index]))
         straight = abs(motion[5]) > _ALONG * shift and turn < _FEW * turn_sigma
-        if verdict == "moved" and straight and not remark:
+        other = "" if verdict == "still" else _in_place_of(system.state.cameras, index, whole)
+        if other:
+            remark = (
+                f"it stands where {other} was calibrated to stand: are the names or cables of the "
+                "two exchanged?"
+            )
+        elif verdict == "moved" and straight and not remark:
             focal = -camera.fx * motion[5] / float(np.median(camera.depths(points)))
             remark = (
                 f"it went straight along its axis, so its focus may have been touched instead "
@@ -197,6 +202,28 @@ def _device(
         focal_sigma_px=camera.fx * wider * float(spread), sigma_px=float(fit.sigma_px[index]),
         before_px=before, after_px=after, remark=remark,
     )  # fmt: skip
+
+
+def _in_place_of(cameras: CameraArray, index: int, motion: Floats) -> str:
+    """The device in whose place one stands after a motion (7,), or ""."""
+    now = moved_camera(cameras[index], motion)
+    way = float(np.linalg.norm(now.centre - cameras[index].centre))
+    for other in cameras:
+        turned = now.camera_from_world @ other.camera_from_world.inverse()
+        near = np.linalg.norm(now.centre - other.centre) < _SAME_PLACE * way
+        if other.name != now.name and near and _angle(turned) < _SAME_PLACE:
+            return other.name
+    return ""
+
+
+def _angle(motion: Pose) -> float:
+    return float(np.linalg.norm(motion.rotation_vector()))
+
+
+def _rms(miss: Floats) -> float:
+    """Root mean square of what is known; NaN when nothing is."""
+    known = miss[np.isfinite(miss)]
+    return float(np.sqrt((known**2).mean())) if len(known) else float("nan")
 
 
 def _size(vector: Floats, covariance: Floats) -> tuple[float, float]:

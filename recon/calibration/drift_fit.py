@@ -32,6 +32,7 @@ _CHOICES = 5  # steps at most at which the still devices are chosen anew ...
 _CHOICE_PX = 0.01  # ... as long as steps are larger than this
 _SETTLED_PX = 3e-4
 _FAR_PX = 10.0  # a device further off than this starts where its own views put it
+_LEAST_SHARE = 1e-3  # a step after which the residual is larger than at the start is shortened
 _FOCAL = 6  # place of the focal length in a motion
 
 
@@ -109,9 +110,17 @@ def matched(
     Corners of a flat board whose place on the body is not known beforehand are left out.
 
     Raises:
-        TakeError: naming every device whose images have another size than calibrated.
+        TakeError: naming every device whose images have another size than calibrated, or both
+            lists of names when nearly none is in both.
     """
     names = observations.device_names
+    common = [name for name in names if name in cameras.names]
+    if len(common) < FEWEST:
+        raise TakeError(
+            f"the take does not fit the cameras: {len(common)} of its devices "
+            f"({', '.join(names)}) are among the calibrated ones ({', '.join(cameras.names)}); at "
+            f"least {FEWEST} are needed: are they those of this array?"
+        )
     problems = [
         f"{name}: images are {size[0]} x {size[1]} px, calibrated were "
         f"{cameras.by_name(name).width} x {cameras.by_name(name).height}"
@@ -218,9 +227,10 @@ def board_factor(
         sigma = np.fmax(noise.sigma_px, np.nanmedian(noise.sigma_px))
         state = _start(cameras, views, used, factor * nominal)
         state = dataclasses.replace(state, motions=np.zeros_like(state.motions))
+        limit_px = max(_typical_px(state, used), _FAR_PX)
         for _ in range(3):
             system = drift_system(state, used, sigma, factor * nominal, settings.board_sigma_mm)
-            state = system.stepped(np.zeros_like(state.motions))
+            state = _stepped(system, np.zeros_like(state.motions), used, limit_px)
         growth, _ = system.growth(everyone)
         factor /= float(np.clip(1.0 + growth, 0.5, 2.0))
     return factor
@@ -238,6 +248,7 @@ def _settled(
     limits = DriftLimits(significant=settings.significant, least_px=settings.least_px)
     lens = np.zeros(len(eligible), dtype=np.bool_)
     still, change = eligible, np.inf
+    limit_px = max(_typical_px(state, used), _FAR_PX)
     for step in range(_STEPS):
         system = drift_system(state, used, sigma, nominal, settings.board_sigma_mm)
         if step < _CHOICES and change > _CHOICE_PX:
@@ -251,8 +262,8 @@ def _settled(
             system.effect_px(index, motions[index] - state.motions[index])
             for index in range(len(eligible))
         )
-        state = system.stepped(motions)
-        if step >= 1 and change < _SETTLED_PX:
+        state = _stepped(system, motions, used, limit_px)
+        if state is system.state or (step >= 1 and change < _SETTLED_PX):
             break
     system = drift_system(state, used, sigma, nominal, settings.board_sigma_mm)
     return DriftFit(
@@ -260,6 +271,24 @@ def _settled(
         views=np.zeros(len(eligible), dtype=np.int64), sigma_px=sigma,
         inflation=inflation(system, still, eligible, settings.least_px),
     )  # fmt: skip
+
+
+def _stepped(
+    system: DriftSystem, motions: Floats, used: BoardObservations, limit_px: float
+) -> DriftState:
+    """As far towards these motions (C, 7) as the usual residual stays below a limit: mostly all."""
+    share = 1.0
+    while share > _LEAST_SHARE:
+        state = system.stepped(motions, share)
+        if _typical_px(state, used) <= limit_px:
+            return state
+        share *= 0.5
+    return system.state
+
+
+def _typical_px(state: DriftState, used: BoardObservations) -> float:
+    size = np.linalg.norm(state.array_state().residuals(used), axis=1)
+    return float(np.median(np.nan_to_num(size, nan=np.inf)))
 
 
 def _changed_lenses(system: DriftSystem, moved: Bools, still: Bools, limit_sigmas: float) -> Bools:

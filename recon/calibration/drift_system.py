@@ -16,6 +16,7 @@ import scipy.sparse
 
 from capture.arrays import Bools, Floats, check_shape
 from capture.camera import Camera, CameraArray
+from capture.errors import SolveError
 from capture.pose import Pose
 from recon.array_state import ArrayState
 from recon.board.observations import BoardObservations
@@ -95,10 +96,16 @@ class DriftSystem:
             out[at] = _inverse(self.matrix[np.ix_(at, at)]) @ self.right[at]
         return out.reshape(-1, MOTION)
 
-    def stepped(self, motions: Floats) -> DriftState:
-        """The estimate with these motions (C, 7) and the poses and shape that suit them."""
+    def stepped(self, motions: Floats, share: float = 1.0) -> DriftState:
+        """The estimate with these motions (C, 7) and the poses and shape that suit them.
+
+        Args:
+            motions: where to go.
+            share: how much of the way is gone.
+        """
         step = motions - self.state.motions
-        loose = scipy.linalg.cho_solve(self.factor, self.rest - self.mixed @ step.ravel())
+        whole = scipy.linalg.cho_solve(self.factor, self.rest - self.mixed @ step.ravel())
+        loose = share * whole
         count = len(self.state.array_from_board)
         turns = loose[: _RIGID * count].reshape(-1, _RIGID)
         poses = tuple(
@@ -107,8 +114,9 @@ class DriftSystem:
         )
         corners = self.state.corners + loose[_RIGID * count :].reshape(-1, 3)
         return DriftState(
-            cameras=self.state.cameras, motions=motions, array_from_board=poses, corners=corners
-        )
+            cameras=self.state.cameras, motions=self.state.motions + share * step,
+            array_from_board=poses, corners=corners,
+        )  # fmt: skip
 
     def tests(self, still: Bools, size: int = _RIGID) -> list[tuple[Floats, Floats]]:
         """By device, its motion (size,) and covariance were all others of `still` (C) still.
@@ -194,6 +202,9 @@ def drift_system(
         nominal: (N, 3) what the board was meant to be, mm.
         board_sigma_mm: how far a corner may stand from there; its size as a whole may hardly.
 
+    Raises:
+        SolveError: when poses and shape are not determined, the cameras being far from true.
+
     References:
         Triggs et al. 2000, Bundle Adjustment - A Modern Synthesis, section 6.1 (elimination).
     """
@@ -216,7 +227,13 @@ def drift_system(
     at, own_at = np.arange(loose_size), np.arange(loose_size, size)
     unseen = np.flatnonzero(np.diag(normal)[: _RIGID * poses] == 0)  # poses that nobody used
     normal[unseen, unseen] = 1.0
-    factor = scipy.linalg.cho_factor(normal[np.ix_(at, at)], lower=True)
+    try:
+        factor = scipy.linalg.cho_factor(normal[np.ix_(at, at)], lower=True)
+    except np.linalg.LinAlgError as error:
+        raise SolveError(
+            "drift: what the devices see of the board does not fit the cameras at all: are they "
+            "those of this array?"
+        ) from error
     mixed = normal[np.ix_(at, own_at)]
     solved = scipy.linalg.cho_solve(factor, np.column_stack([mixed, right[at]]))
     matrix = normal[np.ix_(own_at, own_at)] - mixed.T @ solved[:, :-1]

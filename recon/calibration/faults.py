@@ -107,14 +107,17 @@ def explain_odd(
         limit = _limit(seen.lens, noise_px)
         plain = _fit(seen, board_poses, 0)
         if plain is not None:
-            if _fitting_frames(plain).mean() >= _NEARLY_ALL and plain.miss_px <= limit:
+            in_step = plain.miss_px <= limit
+            if in_step and _fitting_frames(plain).mean() >= _NEARLY_ALL:
                 continue
             parts = _two_places(seen, board_poses, limit)
-            if parts is not None:
+            if parts is not None and not (
+                in_step and _stray(parts[0], parts[1]) > _CLEARLY * _stray(plain)
+            ):
                 split[name] = parts
                 continue
-            if plain.miss_px <= limit:
-                continue
+            if in_step:
+                continue  # single frames are off, wherever it is cut: these were dropped
         shifted = _best_shift(seen, board_poses, plain, limit)
         if shifted is not None:
             frames, what = abs(shifted), "late" if shifted < 0 else "early"
@@ -124,6 +127,10 @@ def explain_odd(
                 "; check its trigger cable, or cut its first frames"
             )
             continue
+        if np.isin(np.unique(seen.frame), list(board_poses)).sum() < _LEAST_FRAMES:
+            continue  # too few to tell
+        if plain is not None and _fitting_frames(plain).mean() >= _NEARLY_ALL:
+            continue  # noisy, or of another lens model: it is in step, and the verdict tells it
         said[name] = (
             f"{name}: its pictures fit those of no other device, at any shift up to "
             f"{_LONGEST_SHIFT} frames: was it triggered with the others, and did its lens keep "
@@ -278,6 +285,11 @@ def _fitting_frames(fit: _Fit) -> Bools:
     return np.array(
         [fit.near[fit.frame == frame].mean() >= _FITS for frame in np.unique(fit.frame)]
     )
+
+
+def _stray(*fits: _Fit) -> int:
+    """How many frames do not fit."""
+    return int(sum((~_fitting_frames(fit)).sum() for fit in fits))
 
 
 def _two_places(

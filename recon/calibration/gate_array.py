@@ -60,11 +60,12 @@ def volume_findings(report: Mapping[str, Any], settings: GateSettings) -> list[F
     """Where in the face volume the board is missing, one finding a region."""
     volume = part_of(report, "volume")
     found = []
-    if number_at(volume, "visible") < _LEAST_VISIBLE:
+    alone = len(rows_of(report, "devices")) == 1  # then no face is measured
+    if not alone and number_at(volume, "visible") < _LEAST_VISIBLE:
         words = (
             f"two devices see {100 * number_at(volume, 'visible'):.0f} % of the face volume only, "
-            f"a ball of {number_at(volume, 'radius_mm'):.0f} mm about the world's origin: set "
-            "volume_radius_mm to what the array looks at"
+            f"a ball of {number_at(volume, 'radius_mm'):.0f} mm about the point the array looks "
+            "at: set volume_mm to the size of what it looks at"
         )
         found.append(Finding(level=WARN, rank=4, words=words))
     poses = rows_of(volume, "thin_poses")
@@ -151,8 +152,8 @@ def _determined(report: Mapping[str, Any], settings: GateSettings) -> Finding | 
         return None
     words = (
         "these poses do not determine lenses and places, or how well could not be computed: "
-        f"{settings.usable_views} more poses or more, each showing most of the board to two "
-        "devices at least"
+        f"{settings.usable_views} more poses or more, each showing most of the board"
+        + (" to two devices at least" if len(rows) > 1 else "")
     )
     return Finding(level=BAD, rank=1, words=words, more_poses=settings.usable_views)
 

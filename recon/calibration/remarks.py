@@ -76,8 +76,8 @@ def _device_warnings(report: Mapping[str, Any]) -> list[str]:
             )
         loose = (device["fx_sigma_px"] or np.inf) / device["fx_px"]
         if not loose <= _LOOSE_FOCAL:
-            told = f"to {100 * loose:.2f} %" if np.isfinite(loose) else "not at all"
-            out.append(f"{name}: its focal length is known {told}; tilt the board more before it.")
+            told = f"known to {100 * loose:.2f} %" if np.isfinite(loose) else "not known"
+            out.append(f"{name}: its focal length is {told}; tilt the board more before it.")
         if (device["mean_reprojection_px"] or 0.0) > _ODD_ONE * usual:
             out.append(
                 f"{name}: residual {device['mean_reprojection_px']:.2f} px where {usual:.2f} px is "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -15,6 +16,7 @@ from recon.array_state import ArrayState
 from recon.board.observations import BoardObservations
 from recon.board.shape import BoardShape
 from recon.board.view_check import check_upright, check_views
+from recon.calibration.board_places import place_boards
 from recon.calibration.chain import first_guess
 from recon.calibration.covariance import ArrayCovariance, array_covariance
 from recon.calibration.faults import odd_devices
@@ -49,7 +51,7 @@ class CalibrateSettings:
         min_corners: views with fewer corners are refused.
         max_blur_px: views with wider edges (standard deviation, px) are refused.
         still_px: frames where no corner moved by more than this since the last are left out.
-        max_poses: of more board poses, so many are used, evenly spread over the take.
+        max_poses: of more board poses, so many are used: those that cover the devices best.
         least_views: a device that used the board in fewer frames is refused.
         least_poses: a take with fewer board poses is refused.
         loss_px: scale of the Cauchy loss.
@@ -57,7 +59,7 @@ class CalibrateSettings:
         free_board: whether the board's shape is solved for as well; its size stays nominal.
         held_out: fraction of the poses left out of a second solve to check the first.
         halves: whether two halves of the poses are solved apart and compared.
-        volume_mm: radius of the face volume, a ball about the world's origin.
+        volume_mm: radius of the face volume, a ball about the point the array looks at.
         image_up: the side of the images that is up: "top", "bottom", "left", "right".
         world_frame: the frame in which the board itself stands where the world is to be; None
             takes the world from the array.
@@ -97,6 +99,10 @@ class CalibrateSettings:
             problems.append(
                 "focal_guess: focal length over image width must lie in 0.2..50, "
                 f"found {self.focal_guess}"
+            )
+        if self.max_poses < self.least_poses:
+            problems.append(
+                f"max_poses: {self.max_poses} is below least_poses = {self.least_poses}"
             )
         if self.image_up not in IMAGE_UP:
             problems.append(f"image_up: one of {', '.join(IMAGE_UP)}, found {self.image_up!r}")
@@ -190,7 +196,8 @@ def solve_array(
         _look_into(poor[:1], observations, every, shape, settings)
     used = observations.select(kept)
     middle = shape.corners.mean(axis=0)[None]
-    places = np.concatenate([pose.apply(middle) for pose in found.state.array_from_board])
+    poses = [found.state.array_from_board[pose] for pose in np.unique(used.pose).tolist()]
+    places = np.concatenate([pose.apply(middle) for pose in poses])
     world = array_world(found.state.cameras, places, settings.image_up)
     final = found.state.moved(world.world_from_array)
     adjust, refit = _adjusters(shape, settings)
@@ -280,11 +287,16 @@ def _poor_devices(state: ArrayState, observations: BoardObservations, kept: Bool
 def _adjusters(shape: BoardShape, settings: CalibrateSettings) -> tuple[Adjuster, Adjuster]:
     """How to solve everything, and board poses alone, from a start and sightings."""
     options = AdjustOptions(loss_px=settings.loss_px, free_board=settings.free_board)
-    fixed = AdjustOptions(loss_px=settings.loss_px, free_lenses=False, free_cameras=False)
-    return (
-        lambda start, seen: _adjust(start, seen, options, shape).state,
-        lambda start, seen: adjust_array(start, seen, fixed).state,
-    )
+
+    def refit(start: ArrayState, seen: BoardObservations) -> ArrayState:
+        placed = np.ones(shape.face_count, dtype=np.bool_)
+        solved = dataclasses.replace(shape, corners=start.corners, placed=placed)
+        poses = list(start.array_from_board)
+        for place in place_boards(seen, solved, start.cameras, poses):
+            poses[place.pose] = place.world_from_board
+        return ArrayState(start.cameras, tuple(poses), start.corners)
+
+    return lambda start, seen: _adjust(start, seen, options, shape).state, refit
 
 
 def _adjust(

@@ -56,8 +56,20 @@ def split_half(
     for half in halves:
         if ((half.view_counts() > 0).sum(axis=1) < least_views).any():
             return SplitHalf(remark="too few poses to split them")
+        if not _hangs_together(half):
+            return SplitHalf(remark="half of the poses do not tie all devices together")
     one, other = (adjust(state, half) for half in halves)
     return projection_difference(one.cameras, other.cameras, volume)
+
+
+def _hangs_together(half: BoardObservations) -> bool:
+    """Whether every device is tied to every other by board poses that two see."""
+    seen = half.view_counts() > 0
+    joined = (seen.astype(np.int64) @ seen.T.astype(np.int64)) > 0
+    reached = joined[0]
+    for _ in range(len(joined)):
+        reached = joined[reached].any(axis=0)
+    return bool(reached.all())
 
 
 def projection_difference(one: CameraArray, other: CameraArray, volume: Floats) -> SplitHalf:

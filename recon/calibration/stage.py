@@ -12,7 +12,7 @@ import numpy as np
 
 from capture.camera import CameraArray
 from capture.camera_file import read_cameras, write_cameras
-from capture.errors import SolveError, TakeError
+from capture.errors import SettingsError, SolveError, TakeError
 from capture.pose import Pose
 from capture.product import is_current, replacing, stage_record, write_record
 from capture.progress import Progress, silent
@@ -29,6 +29,7 @@ from recon.board.take_devices import TakeDevices
 from recon.board.view_check import check_views
 from recon.calibration.chosen_world import ChosenWorld, choose_world
 from recon.calibration.corner_log import write_corner_log
+from recon.calibration.geometry import ball_points
 from recon.calibration.report import (
     ReportExtras,
     calibration_report,
@@ -40,6 +41,7 @@ from recon.calibration.solver import ArraySolution, CalibrateSettings, solve_arr
 
 __all__ = ["CalibrateSettings", "calibrate", "corner_log_path", "report_path"]
 
+_BAR_SPREAD = 3.0  # a bar across the face volume may be off by so many times a point of it
 _SURE = 4.0  # standard deviations of the bar's length by which it must be off as well
 
 
@@ -68,18 +70,25 @@ def calibrate(
         mm.
 
     Raises:
+        SettingsError: when both a frame and a previous session are to give the world, or `out` has
+            the name of the report.
         TakeError: naming every device that saw too little of the board, with its counts and the
             reason its images show; that is late, moved, mirrored or exchanged with another; or the
             scale bar, when it does not have its length.
         SolveError: when the devices do not hang together, or the solve fails.
     """
-    out = Path(out)
+    out, products = Path(out), _products(Path(out))
+    if previous is not None and settings.world_frame is not None:
+        raise SettingsError(
+            f"world_frame = {settings.world_frame} and a previous session both name the world: "
+            "give one of them"
+        )
     body = board if isinstance(board, BoardBody) else BoardBody.of(board)
     inputs = {"frames": take.frames_hash(), "board": _digest(_plain_body(body))}
     if previous is not None:
         inputs["previous"] = _digest([_plain_camera(camera) for camera in previous])
     record = stage_record("calibrate", settings, inputs)
-    if is_current(out, record) and report_path(out).is_file():
+    if all(is_current(product, record) for product in products):
         return read_cameras(out)
     seen, odd = _sightings(take, body, settings, progress)
     try:
@@ -99,7 +108,7 @@ def calibrate(
         scale_bar=None if bar is None else scale_bar_numbers(bar),
     )  # fmt: skip
     report = calibration_report(solution, body, seen.tally, extras)
-    report["warnings"] = [*report["warnings"], *odd]
+    report["warnings"] = [*report["warnings"], *odd, *_unseen(bar)]
     state = solution.state
     if chosen is not None:
         state = state.moved(chosen.world.world_from_array)
@@ -108,7 +117,8 @@ def calibrate(
     write_corner_log(log, solution)
     _write_report(report_path(out), report)
     write_cameras(out, state.cameras, summary_of(report))
-    write_record(out, record)
+    for product in products:
+        write_record(product, record)
     return read_cameras(out)  # as a second run finds them
 
 
@@ -120,6 +130,23 @@ def report_path(cameras: Path) -> Path:
 def corner_log_path(cameras: Path) -> Path:
     """Where the table of rejected corners stands, beside the cameras."""
     return Path(cameras).with_name("rejected_corners.csv")
+
+
+def _products(out: Path) -> tuple[Path, ...]:
+    """All that is written, the cameras last; refused where one would replace another."""
+    beside = corner_log_path(out), report_path(out)
+    if out in beside:
+        raise SettingsError(f"{out}: that name is taken by what stands beside the cameras")
+    return *beside, out
+
+
+def _unseen(bar: BarLength | None) -> list[str]:
+    if bar is None or bar.frames:
+        return []
+    return [
+        "The board file has a scale bar, and no frame shows both its ends to two devices: nothing "
+        "checks the size of the squares."
+    ]
 
 
 def _sightings(
@@ -154,7 +181,8 @@ def _check_bar(
     if not bar.frames:
         return bar
     off = abs(bar.ratio - 1.0)
-    sure = not off * bar.length_mm <= _SURE * bar.sigma_mm
+    sigma_mm = float(np.hypot(bar.sigma_mm, _BAR_SPREAD * _volume_sigma_mm(solution, settings)))
+    sure = not off * bar.length_mm <= _SURE * sigma_mm
     if off > settings.bar_tolerance and sure:
         square_mm = _square_mm(body)
         fitting = (
@@ -168,6 +196,16 @@ def _check_bar(
             "is wrong; measure both again"
         )
     return bar
+
+
+def _volume_sigma_mm(solution: ArraySolution, settings: CalibrateSettings) -> float:
+    """What the calibration's own uncertainty does to a point of the face volume, rms, mm."""
+    if solution.covariance is None:
+        return float("inf")  # such a calibration proves nothing of the bar
+    points = ball_points(np.zeros(3), settings.volume_mm, 5)
+    sigma = solution.covariance.triangulation_sigma(points)
+    traces = np.einsum("nii->n", sigma)
+    return float(np.sqrt(np.nanmean(traces))) if np.isfinite(traces).any() else float("inf")
 
 
 def _square_mm(body: BoardBody) -> float | None:
@@ -210,8 +248,8 @@ def _plain_body(body: BoardBody) -> dict[str, Any]:
 
 def _plain_camera(camera: Any) -> list[Any]:
     return [
-        camera.name, camera.matrix.tolist(), camera.distortion.tolist(),
-        camera.camera_from_world.matrix().tolist(),
+        camera.name, camera.width, camera.height, camera.matrix.tolist(),
+        camera.distortion.tolist(), camera.camera_from_world.matrix().tolist(),
     ]  # fmt: skip
 
 

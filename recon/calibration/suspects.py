@@ -6,15 +6,13 @@ import dataclasses
 
 import numpy as np
 
-from capture.arrays import Ints
 from capture.camera import Camera, CameraArray
 from capture.pose import Pose
 from recon.array_state import ArrayState
 from recon.board.observations import BoardObservations
 from recon.board.shape import BoardShape
-from recon.calibration.chain import board_poses
+from recon.calibration.board_places import place_boards
 from recon.calibration.faults import DeviceViews, explain_odd
-from recon.colmap import AdjustOptions, adjust_array
 
 _MOST_FRAMES = 400  # of a long take so many are looked at, in one stretch
 
@@ -62,16 +60,12 @@ def _motion(healthy: ArrayState, seen: BoardObservations, shape: BoardShape) -> 
     solved = dataclasses.replace(
         shape, corners=healthy.corners, placed=np.ones(shape.face_count, dtype=np.bool_)
     )
-    start = ArrayState(healthy.cameras, board_poses(seen, solved, healthy.cameras), healthy.corners)
-    fixed = AdjustOptions(free_lenses=False, free_cameras=False)
-    found = adjust_array(start, seen, fixed).state
-    miss = np.linalg.norm(found.residuals(seen), axis=1)
-    poses: Ints = np.unique(seen.pose)
-    good = [
-        int(pose) for pose in poses
-        if np.nanmedian(np.nan_to_num(miss[seen.pose == pose], nan=1e6)) < _near_px(healthy.cameras)
-    ]  # fmt: skip
-    return {seen.frames[pose]: found.array_from_board[pose] for pose in good}
+    near = _near_px(healthy.cameras)
+    return {
+        place.frame: place.world_from_board
+        for place in place_boards(seen, solved, healthy.cameras)
+        if float(np.median(list(place.miss_px.values()))) < near
+    }
 
 
 def _near_px(cameras: CameraArray) -> float:

@@ -105,7 +105,8 @@ def _thin_words(gap: Gap, radius_mm: float) -> str:
     if gap.signs == ():
         return (
             f"the board was in {100 * gap.share:.0f} % of the face volume only, a ball of "
-            f"{radius_mm:.0f} mm about the world's origin: hold the board where the face will be"
+            f"{radius_mm:.0f} mm about the point the array looks at: hold the board where the "
+            "face will be"
         )
     little = "nothing" if gap.share < 0.05 else "little"
     way = way_from_middle(gap.middle * radius_mm, radius_mm)

@@ -16,6 +16,7 @@ from capture.progress import Progress, silent
 from capture.take import Take
 from recon.board.corner_cache import CornerCache
 from recon.board.corners import CornerLimits
+from recon.board.diagnosis import explain_blind, merged_words
 from recon.board.sightings import observe_board
 from recon.calibration.board_places import place_boards
 from recon.photometry.flat_samples import DarkLevel, FlatReadings, dark_levels, sample_flats
@@ -39,15 +40,18 @@ from recon.photometry.words import Evidence, coverage_refusals, photometric_warn
 
 _CELLS = 8  # of the coverage, along the longer side
 _MISS_PX = 2.0  # a board further off than this was not seen by the camera that is claimed
+_MANY = 0.2  # share of a device's views that are off by so much, from which it is told
 
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """All readings of one calibration."""
+    """All readings of one calibration; what is odd in the board's images, and of its places."""
 
     white: WhiteReadings | None
     flat: FlatReadings | None
     black: dict[str, DarkLevel]
+    odd: tuple[str, ...] = ()
+    displaced: tuple[str, ...] = ()
 
 
 def calibrate_photometry(
@@ -105,19 +109,22 @@ def _read(
     names = sources.first.device_names
     levels = np.array([_black(sources, settings, black, name) for name in names])
     white = flat = None
+    odd: tuple[str, ...] = ()
+    displaced: tuple[str, ...] = ()
     if sources.board_take is not None:
-        white = _read_board(sources, settings, levels, progress)
+        white, odd, displaced = _read_board(sources, settings, levels, progress)
     if sources.flat is not None:
         flat = sample_flats(
             sources.flat, names, black=levels, same_light=settings.same_light,
             slope=settings.flat_slope, progress=progress,
         )  # fmt: skip
-    return _Seen(white, flat, black)
+    return _Seen(white, flat, black, odd, displaced)
 
 
 def _read_board(
     sources: LightSources, settings: PhotometricSettings, levels: Floats, progress: Progress
-) -> WhiteReadings:
+) -> tuple[WhiteReadings, tuple[str, ...], tuple[str, ...]]:
+    """The readings, what is odd in the images, and which devices are off their cameras at times."""
     take, board, array = sources.board_take, sources.board, sources.cameras
     if take is None or board is None or array is None:
         raise InputError("a board take needs its board and cameras")
@@ -132,6 +139,9 @@ def _read_board(
     cache = CornerCache(take, board)
     found = observe_board(take, board, limits, cache=cache, progress=progress)
     observations = found.observations
+    odd = merged_words(explain_blind(take, board, found), len(take.device_names))
+    if not len(observations):
+        raise_all(f"{take.folder}: no device sees this board", odd or ["no usable view"], TakeError)
     places = place_boards(observations, board.shape(), cameras)
     misses: list[list[float]] = [[] for _ in cameras]
     views = []
@@ -148,9 +158,21 @@ def _read_board(
     ]
     raise_all(str(take.folder), problems, TakeError)
     wanted = SampleLimits(edge_px=settings.edge_px, max_tilt_deg=settings.max_tilt_deg)
-    return sample_whites(
+    readings = sample_whites(
         take, board, cameras, views, black=levels, limits=wanted, progress=progress
     )
+    return readings, tuple(odd), tuple(_displaced(cameras.names, misses))
+
+
+def _displaced(names: tuple[str, ...], misses: list[list[float]]) -> list[str]:
+    """Devices of whose views many were not read, the board lying elsewhere in them."""
+    off = [sum(miss > _MISS_PX for miss in mine) for mine in misses]
+    return [
+        f"{name}: in {count} of {len(mine)} views the board is more than {_MISS_PX:g} px from "
+        "where its camera expects it, and was not read: has it moved since it was calibrated?"
+        for name, mine, count in zip(names, misses, off, strict=True)
+        if count > _MANY * len(mine)
+    ]
 
 
 def _check_counts(
@@ -173,6 +195,8 @@ def _check_counts(
             f"{settings.least_samples} are needed: hold the board nearer and fill the image, "
             "with light and exposure that keep white below clipping"
         )
+    if problems:
+        problems += [*seen.odd, *seen.displaced]
     raise_all("devices saw too little light", problems, TakeError)
 
 
@@ -284,7 +308,7 @@ def _report(
         for name, level in seen.black.items()
         if level.uneven
     ]
-    warnings += photometric_warnings(model, evidence)
+    warnings += [*seen.odd, *seen.displaced, *photometric_warnings(model, evidence)]
     black = "dark take" if seen.black else "settings"
     return {
         "sources": {

@@ -158,6 +158,25 @@ def test_a_model_of_old_has_no_rigs(tmp_path: Path) -> None:
     assert_same(read_model(tmp_path / "m"), array)
 
 
+def test_a_folder_that_holds_more_than_a_model_is_not_replaced(tmp_path: Path) -> None:
+    array, folder = random_array(41, count=2), tmp_path / "m"
+    write_model(folder, array, text=True)
+    write_model(folder, array)
+    (folder / "thesis.txt").write_text("years")
+    with pytest.raises(CameraError, match=r"m: holds thesis\.txt, which a model"):
+        write_model(folder, array)
+    assert (folder / "thesis.txt").read_text() == "years"
+
+
+def test_image_names_with_spaces_are_refused_never_cut(tmp_path: Path) -> None:
+    array, folder = random_array(42, count=2), tmp_path / "m"
+    write_model(folder, array, text=True)
+    path = folder / "images.txt"
+    path.write_text(path.read_text().replace("/0000.png", "/00 00.png", 1))
+    with pytest.raises(CameraError, match=r"images\.txt: .*name '.*/00 00\.png' has spaces"):
+        read_model(folder)
+
+
 @pytest.mark.parametrize("name", ["cameras", "images", "rigs", "frames", "points3D"])
 @pytest.mark.parametrize("count", [2**60, 2**32, 200])
 def test_counts_beyond_the_file_are_refused_at_once(tmp_path: Path, name: str, count: int) -> None:

@@ -248,6 +248,21 @@ def test_a_page_that_does_not_fit_is_told(page: str, told: str) -> None:
     assert told in str(caught.value)
 
 
+def test_the_page_that_a_refusal_names_does() -> None:
+    board = charuco(9, 7, square_mm=141.03, marker_mm=100.0, dictionary="DICT_5X5_1000")
+    with pytest.raises(InputError) as caught:
+        lay_out(board_pattern(board), "words", "A4")
+    named = re.search(r"take --page (\d+x\d+),", str(caught.value))
+    assert named is not None
+    assert lay_out(board_pattern(board), "words", named[1]).loops
+
+
+def test_a_sheet_that_cannot_be_written_leaves_no_board_file(tmp_path: Path) -> None:
+    (tmp_path / "b.pdf").mkdir()
+    assert main(["board", "--out", str(tmp_path / "b.pdf")]) == 2
+    assert [path.name for path in tmp_path.iterdir()] == ["b.pdf"]
+
+
 def test_the_markers_of_a_scale_bar_are_found(tmp_path: Path) -> None:
     bar = ScaleBar(dictionary="DICT_4X4_50", markers=(7, 3), marker_mm=30.0, length_mm=400.0)
     path = tmp_path / "bar.pdf"

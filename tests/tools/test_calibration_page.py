@@ -298,6 +298,20 @@ def test_slices_show_the_right_side_of_the_volume() -> None:
     assert "#eeeeee" not in side + above
 
 
+def test_a_named_world_says_whose_axes_the_slices_have(tmp_path: Path) -> None:
+    report = full_report(NAMES)
+    _, text = page_of(report, tmp_path / "own.html")
+    assert "not of the world" not in text
+    motion = np.eye(4)
+    motion[:3, 3] = [9.2, 41.8, -0.2]
+    report["world_from_volume"] = motion.tolist()
+    _, text = page_of(report, tmp_path / "named.html")
+    assert text.count("which is at x 9, y 42, z 0 mm in the world, to the right, up") == 2
+    report["world_from_volume"] = [[1, 2], [3]]
+    _, text = page_of(report, tmp_path / "odd.html")
+    assert "not of the world" not in text
+
+
 def test_cells_tile_without_gaps_and_keep_their_colours() -> None:
     scale = Scale(low=0.0, high=2.0, stops=("#000001", "#000002", "#000003"))
     text = cells(np.array([[0.0, 1.0, 1.0], [np.nan, 5.0, -3.0]]), scale, 3.333, (0.0, 0.0))

@@ -61,6 +61,8 @@ def test_the_report_says_by_camera_what_was_converted(
 @pytest.mark.parametrize(
     ("words", "said"),
     [
+        (["--out", "k.yaml", "--to", "kalibr"], "--out k.yaml: is what is read"),
+        (["--out", "."], "holds k.yaml, which a model in its place would delete"),
         (["--out", "x.xml"], ".xml may be opencv or metashape; name the format with --to"),
         (["--out", "x.json", "--scale", "0"], "--scale: expected a number between"),
         (["--out", "x.json", "--from", "opencv"], "cv2.FileStorage"),

@@ -81,6 +81,8 @@ def test_what_moved_is_solved_anew(place: Path, capsys: pytest.CaptureFixture[st
     page = (place / "new.drift.html").read_text(encoding="utf-8")
     assert "cam01 has changed, the other 3 have not" in page
     assert "Solved anew: cam01" in page
+    assert '<div class="summary bad">' in page
+    assert "Array:</b> cam01 has moved by 2." in page
     report = (place / "new.drift.json").read_bytes()
     assert main(words(place, "--resolve", "cam01", "--out", str(new), "--json")) == 0
     assert (place / "new.drift.json").read_bytes() == report

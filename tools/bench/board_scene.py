@@ -14,6 +14,7 @@ from capture.pose import Pose
 from recon.array_state import ArrayState
 from recon.board.charuco import Board
 from recon.board.observations import BoardObservations
+from recon.calibration.geometry import rigid_fit
 from tools.bench.board_arrays import board_yaws, device_directions
 
 _PRINT = 8.0  # pixels of the drawn pattern a millimetre
@@ -249,14 +250,7 @@ def triangulation_error(truth: CameraArray, found: CameraArray, seed: int = 0) -
 
     Exact projections of 400 points in a 160 mm ball around the origin by the true cameras are
     triangulated by the found ones, and the result is aligned rigidly, without scale.
-
-    References:
-        Umeyama 1991 with the scale held at 1.
     """
     points = face_points(seed)
     solved = triangulate(truth, found, points)
-    a, b = solved - solved.mean(axis=0), points - points.mean(axis=0)
-    u, _, vt = np.linalg.svd(a.T @ b)
-    u[:, 2] *= np.linalg.det(u @ vt)
-    error: Floats = a @ (u @ vt) - b
-    return error
+    return rigid_fit(solved, points).apply(solved) - points

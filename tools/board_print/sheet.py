@@ -17,6 +17,7 @@ still be measured on the mounted board.
 
 from __future__ import annotations
 
+import math
 import re
 import textwrap
 from dataclasses import dataclass
@@ -150,10 +151,11 @@ def _does_not_fit(
         name for name, sides in PAGES_MM.items()
         if max(need) <= max(sides) and min(need) <= min(sides)
     ]  # fmt: skip
-    hint = f"--page {larger[0]}" if larger else f"--page {need[0]:.0f}x{need[1]:.0f}"
+    hint = f"--page {larger[0]}" if larger else f"--page {math.ceil(need[0])}x{math.ceil(need[1])}"
     return (
         f"--page {page}: the board of {board[0]:g} x {board[1]:g} mm needs "
-        f"{need[0]:.0f} x {need[1]:.0f} mm with its margins, bar and caption, the page has "
+        f"{math.ceil(need[0])} x {math.ceil(need[1])} mm with its margins, bar and "
+        f"caption, the page has "
         f"{size[0]:g} x {size[1]:g} mm; take {hint}, or a smaller board; it is never scaled"
     )
 

@@ -152,7 +152,8 @@ def _uncertainty(report: Mapping[str, Any]) -> list[Section]:
                             words=f"{told}; {number(limits[0])} {MICRO} are asked"),)  # fmt: skip
     lead = (
         "<p>One standard deviation of a triangulated point, all three directions together "
-        "(root of the trace of its covariance), in slices through the middle of the volume.</p>"
+        "(root of the trace of its covariance), in slices through the middle of the volume."
+        f"{_own_axes(report)}</p>"
     )
     return [
         Section(anchor="uncertainty", title="Uncertainty of triangulation",
@@ -209,13 +210,25 @@ def _volume(report: Mapping[str, Any]) -> list[Section]:
         body += (
             "<p>Board corners that two or more devices saw together, in cells of "
             f"{grid.step_mm:g} mm, layer by layer as seen from the front. "
-            "Red cells have none, nor do their neighbours.</p>"
+            f"Red cells have none, nor do their neighbours.{_own_axes(report)}</p>"
             f"{colour_scale(BLUES, 0.0, top, 'corners in a cell')}{gallery(figures, 'slices')}"
         )
     return [
         Section(anchor="volume", title="Coverage of the face volume", body=body,
                 verdicts=(verdict,))
     ]  # fmt: skip
+
+
+def _own_axes(report: Mapping[str, Any]) -> str:
+    """Where x, y, z of the volume lie, when a named pose or an earlier session gave the world."""
+    motion = table_of(report, "world_from_volume")
+    if motion is None or motion.shape != (4, 4) or not np.isfinite(motion).all():
+        return ""
+    x, y, z = (f"{round(value) + 0}" for value in motion[:3, 3].tolist())
+    return (
+        " Here x, y and z are those of the volume, not of the world: from its middle, which is at "
+        f"x {x}, y {y}, z {z} mm in the world, to the right, up and towards the array."
+    )
 
 
 def _devices(inputs: ReportInputs) -> list[Section]:
@@ -243,8 +256,8 @@ def _split_half(report: Mapping[str, Any]) -> list[Section]:
         return []
     parts = [
         "<p>The array is calibrated twice, from one half of the poses and from the other, and "
-        "both project the same points of the face volume: the difference is what to expect when "
-        "the calibration is done again.</p>"
+        "both project the same points of the face volume. By chance alone the two differ by about "
+        "twice the error of the calibration from all poses.</p>"
     ]
     if remark:
         parts.append(f"<p>{escape(remark)}</p>")

@@ -34,13 +34,12 @@ def write_drift_page(document: Mapping[str, Any], out: Path) -> Path:
 
 
 def _verdict(document: Mapping[str, Any]) -> Section:
-    level = {"still": "good", "moved": "warn", "anew": "bad"}[document["verdict"]]
-    words = list(document["words"])
-    if level == "good" and (document["unchecked"] or len(words) > 1):
-        level = "warn"
+    level = "good" if document["verdict"] == "still" else "bad"
+    first, *rest = document["words"]
+    verdicts = [Verdict(level=level, subject="Array:", words=first)]
+    verdicts += [Verdict(level="warn", subject="Array:", words=line) for line in rest]
     after = document.get("after")
-    rest = "".join(f"<li>{escape(line)}</li>" for line in words[1:])
-    body = f"<ul>{rest}</ul>" if rest else ""
+    body = ""
     if after is not None:
         solved = ", ".join(after["resolved"]) or "nothing"
         body += f"<p>{escape(f'Solved anew: {solved}. Then: ' + after['headline'])}</p>"
@@ -55,7 +54,7 @@ def _verdict(document: Mapping[str, Any]) -> Section:
         anchor="verdict",
         title="Verdict",
         body=body + facts(numbers),
-        verdicts=(Verdict(level=level, subject="Array:", words=words[0]),),
+        verdicts=tuple(verdicts),
     )
 
 

@@ -87,13 +87,16 @@ def run(arguments: Arguments, progress: Progress) -> dict[str, Any]:
             f"--out {arguments.out}: an SVG holds one sheet, this body needs {len(sheets)}; choose "
             f"one with --face ({known}), or write a .pdf"
         )
-    beside = None
+    beside, wanted = None, b""
     if arguments.board is None:
-        beside = _write_board_file(arguments.out, body.faces[0].board, sheets[0].bar_mm)
+        beside, wanted = _board_file(arguments.out, body.faces[0].board, sheets[0].bar_mm)
     if suffix == ".svg":
         write_svg(arguments.out, sheets[0])
     else:
         write_pdf(arguments.out, sheets)
+    if beside is not None:
+        with replacing(beside) as partial:
+            partial.write_bytes(wanted)
     progress(1, 1, "board")
     return {
         "out": str(arguments.out),
@@ -143,20 +146,16 @@ def _sheets(body: BoardBody, arguments: Arguments) -> list[Sheet]:
     return sheets
 
 
-def _write_board_file(sheet: Path, board: FlatBoard, bar_mm: float) -> Path:
-    """Write the board file of a sheet beside it; one that says otherwise stays, and is told."""
+def _board_file(sheet: Path, board: FlatBoard, bar_mm: float) -> tuple[Path, bytes]:
+    """Where the board file of a sheet stands, and what it holds; one that differs is refused."""
     path = sheet.with_suffix(".toml")
-    wanted = board_toml(board, bar_mm)
-    if path.exists():
-        if path.read_bytes() == wanted.encode():
-            return path
+    wanted = board_toml(board, bar_mm).encode()
+    if path.exists() and (path.is_dir() or path.read_bytes() != wanted):
         raise InputError(
             f"{path}: exists and says otherwise, with your calliper reading perhaps; draw it with "
             f"--board {path}, or choose another --out"
         )
-    with replacing(path) as partial:
-        partial.write_text(wanted, encoding="utf-8", newline="\n")
-    return path
+    return path, wanted
 
 
 def _option(name: str) -> str:

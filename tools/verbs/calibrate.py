@@ -14,6 +14,7 @@ from typing import Annotated, Any
 import tyro
 
 from capture.camera_file import read_cameras
+from capture.errors import SettingsError
 from capture.progress import Progress
 from capture.take import Take
 from recon.board.body import read_body
@@ -44,6 +45,9 @@ class Arguments(Options):
 
 def run(arguments: Arguments, progress: Progress) -> dict[str, Any]:
     """Calibrate, draw the page, report the residuals."""
+    page = arguments.out.with_suffix(".html")
+    if page == arguments.out:
+        raise SettingsError(f"{page}: expected the name of a .json file; the page is called so")
     take = Take.open(arguments.take)
     board = read_body(arguments.board)
     previous = None if arguments.previous is None else read_cameras(arguments.previous)
@@ -51,7 +55,6 @@ def run(arguments: Arguments, progress: Progress) -> dict[str, Any]:
         take, board, arguments.settings, arguments.out, previous=previous, progress=progress
     )
     report = json.loads(report_path(arguments.out).read_text(encoding="utf-8"))
-    page = arguments.out.with_suffix(".html")
     write_calibration_page(cameras, report, page)
     plain = {k: v for k, v in report.items() if isinstance(v, str | int | float | bool)}
     return {

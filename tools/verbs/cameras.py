@@ -55,6 +55,11 @@ class Arguments(Options):
 def run(arguments: Arguments, progress: Progress) -> dict[str, Any]:
     """Read, scale, write, read back, and report by camera what was converted."""
     check_unit(arguments.scale, "--scale")
+    if arguments.out.resolve() == arguments.source.resolve():
+        raise CameraError(
+            f"--out {arguments.out}: is what is read, and holds what a copy does not (gains, the "
+            "calibration's report, points); choose another name"
+        )
     kind = arguments.source_kind or recognise(arguments.source)
     to = arguments.to or kind_of_suffix(arguments.out)
     cameras = read_any(arguments.source, kind, arguments.unit_mm)

@@ -18,13 +18,14 @@ import tyro
 from capture.camera import CameraArray
 from capture.camera_file import cameras_from_document, write_cameras
 from capture.documents import read_json
-from capture.errors import CameraError, InputError, SolveError
+from capture.errors import CameraError, InputError, SolveError, TakeError
 from capture.product import replacing
 from capture.progress import Progress
 from capture.take import Take
 from recon.board.body import read_body
 from recon.board.corner_cache import CornerCache
 from recon.board.corners import CornerLimits
+from recon.board.diagnosis import explain_blind, merged_words
 from recon.board.observations import BoardObservations
 from recon.board.shape import BoardShape
 from recon.board.sightings import observe_board
@@ -69,11 +70,18 @@ def run(arguments: Arguments, progress: Progress) -> dict[str, Any]:
     settings = arguments.settings
     limits = CornerLimits(max_blur_px=settings.max_blur_px, max_poses=settings.max_poses)
     cache = CornerCache(take, body)
-    seen = observe_board(take, body, limits, cache=cache, progress=progress).observations
-    shape = body.shape()
+    found = observe_board(take, body, limits, cache=cache, progress=progress)
+    seen, shape = found.observations, body.shape()
+    odd = merged_words(explain_blind(take, body, found), len(take.device_names))
     progress(0, 1, "drift")
-    report = check_drift(cameras, seen, shape, settings)
+    try:
+        report = check_drift(cameras, seen, shape, settings)
+    except TakeError as error:
+        if odd:
+            raise TakeError(f"{error}\nwhat the images show:\n  - " + "\n  - ".join(odd)) from error
+        raise
     told = report.document() | {"take": take.name, "cameras": arguments.cameras.name}
+    told["words"] = [*told["words"], *odd]
     refusal = ""
     if arguments.out is not None:
         refusal = _refusal(report, arguments)

@@ -103,6 +103,8 @@ def test_corners_lie_inside_the_pattern_a_pitch_apart() -> None:
     [
         ({"tags_x": 0}, "tags_x: at least 1, found 0"),
         ({"gap_mm": 25.0}, "not Kalibr's ratio tagSpacing"),
+        ({"gap_mm": 0.3}, "not Kalibr's ratio tagSpacing: 6 perhaps"),
+        ({"border_bits": 9}, "border_bits: at most 8, found 9"),
         ({"tag_mm": float("nan")}, "tag_mm: must be above 0 mm, found nan"),
         ({"layout": "left"}, 'expected "kalibr" or "opencv", found \'left\''),
         ({"dictionary": "DICT_APRILTAG_36h12"}, "did you mean 'DICT_APRILTAG_36"),

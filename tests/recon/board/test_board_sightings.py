@@ -191,5 +191,7 @@ def test_mirrored_sightings_are_named() -> None:
     shape = BoardShape.flat_board(CORNERS)
     assert mirrored_devices(seen, shape) == ["cam1"]
     assert mirrored_devices(seen.select(seen.device == 0), shape) == []
+    mixed = BoardShape.flat_board(CORNERS[np.random.default_rng(1).permutation(len(CORNERS))])
+    assert mirrored_devices(seen, mixed) == []  # another board than the file's
     line = seen.select(seen.corner < 11)  # one row of corners tells nothing
     assert mirrored_devices(line, shape) == []

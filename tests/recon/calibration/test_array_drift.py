@@ -179,6 +179,32 @@ def test_when_most_devices_disagree_none_is_called_the_moved_one() -> None:
         resolve_devices(truth.cameras, ["cam05"], seen, SHAPE)
 
 
+def renamed(cameras: CameraArray, names: list[str]) -> CameraArray:
+    pairs = zip(cameras, names, strict=True)
+    return CameraArray(tuple(dataclasses.replace(camera, name=name) for camera, name in pairs))
+
+
+@pytest.mark.parametrize("by", [2, 3])
+def test_cameras_of_other_devices_end_in_words(by: int) -> None:
+    cameras = truth_of(SCENE).cameras
+    turned = renamed(cameras, [*cameras.names[by:], *cameras.names[:by]])
+    report = check_drift(turned, seen_still(SCENE), SHAPE)
+    assert report.verdict == "anew"
+    json.dumps(report.document(), allow_nan=False)
+
+
+def test_two_exchanged_devices_are_told_as_such() -> None:
+    scene = dataclasses.replace(SCENE, devices=7)
+    truth = truth_of(scene)
+    names = list(truth.cameras.names)
+    names[1], names[4] = names[4], names[1]
+    report = check_drift(renamed(truth.cameras, names), seen_still(scene), SHAPE)
+    assert set(report.moved) == {"cam01", "cam04"}
+    text = "\n".join(report.words())
+    assert "it stands where cam01 was calibrated to stand: are the names or cables" in text
+    assert "it stands where cam04 was calibrated to stand" in text
+
+
 def test_a_wrong_square_size_is_told_as_such() -> None:
     larger = BoardShape.flat_board(1.049 * SHAPE.corners)
     report = check_drift(truth_of(SCENE).cameras, seen_still(SCENE), larger)
@@ -249,6 +275,9 @@ def test_too_little_is_refused_in_words() -> None:
         check_drift(cameras, seen.select(seen.device < 2), SHAPE)
     with pytest.raises(CameraError, match=r"cam9.*did you mean 'cam0"):
         resolve_devices(cameras, ["cam9"], seen, SHAPE)
+    strange = renamed(cameras, [f"left{index}" for index in range(len(cameras))])
+    with pytest.raises(TakeError, match=r"0 of its devices \(cam00, .*calibrated ones \(left0, "):
+        check_drift(strange, seen, SHAPE)
     sizes = ((800, 640), *seen.sizes[1:])
     with pytest.raises(TakeError, match="cam00: images are 800 x 640 px, calibrated were 640"):
         check_drift(cameras, dataclasses.replace(seen, sizes=sizes), SHAPE)

@@ -108,6 +108,30 @@ def test_a_device_that_was_knocked_is_told_from_one_in_step() -> None:
     assert "cam00: it was moved at frame 50" in said["cam00"]
 
 
+def test_single_frames_that_are_off_are_no_move() -> None:
+    truth, _ = video()
+    others = CameraArray(tuple(truth.cameras)[1:])
+    steady, motion = views_of(0, truth.cameras)
+    off = np.random.default_rng(2).choice(90, 7, replace=False)
+    shift = np.where(np.isin(steady.frame, off)[:, None], [9.0, 4.0], 0.0)
+    views = dataclasses.replace(steady, pixels=steady.pixels + shift)
+    assert explain_odd({"cam00": views}, others, motion, 0.1) == {}
+    few = steady.frame < 3
+    rare = DeviceViews(
+        lens=steady.lens, frame=steady.frame[few], board=steady.board[few],
+        pixels=steady.pixels[few] + 40.0 * (steady.frame[few] == 1)[:, None],
+    )  # fmt: skip
+    assert explain_odd({"cam00": rare}, others, motion, 0.1) == {}, "too few frames to tell"
+
+
+def test_a_noisy_device_is_in_step() -> None:
+    truth, _ = video()
+    views, motion = views_of(1, truth.cameras)
+    noise = np.random.default_rng(2).normal(0.0, 1.5, views.pixels.shape)  # px
+    noisy = dataclasses.replace(views, pixels=views.pixels + noise)
+    assert explain_odd({"cam01": noisy}, truth.cameras, motion, 0.1) == {}
+
+
 def test_pictures_that_fit_nothing_are_told() -> None:
     truth, _ = video()
     views, motion = views_of(1, truth.cameras)

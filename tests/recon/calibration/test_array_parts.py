@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from functools import cache
 
 import numpy as np
@@ -22,7 +23,7 @@ from recon.calibration.gauge import board_scale, flat_places, regauged
 from recon.calibration.geometry import ball_points, rigid_fit, triangulate
 from recon.calibration.scale_bar import measure_bar
 from recon.calibration.solver import ArraySolution, CalibrateSettings, solve_array
-from recon.calibration.split_half import projection_difference
+from recon.calibration.split_half import projection_difference, split_half
 from tools.bench.board_scene import A4_BOARD, BoardScene, make_state, observe, triangulation_error
 
 SMALL = BoardScene(size_px=640, focal_px=1440.0, radius_mm=620.0, devices=5, poses=12)
@@ -52,7 +53,7 @@ def two_boards(placed: bool) -> tuple[BoardShape, Floats]:
 @pytest.mark.parametrize("placed", [True, False])
 def test_two_boards_on_one_body_are_solved_together(placed: bool) -> None:
     shape, true = two_boards(placed)
-    scene = dataclasses.replace(SMALL, devices=6, poses=14, noise_px=0.05)
+    scene = dataclasses.replace(SMALL, devices=6, poses=14, noise_px=0.05, hidden=0.6)
     flat = make_state(scene)
     middle = true.mean(axis=0) - A4_BOARD.corners_mm().mean(axis=0)
     poses = tuple(pose @ Pose(np.eye(3), -middle) for pose in flat.array_from_board)
@@ -115,8 +116,9 @@ def literal_covariance(state: ArrayState, seen: BoardObservations, sigma_px: flo
     return found
 
 
-def test_the_covariance_is_that_of_the_whole_problem() -> None:
-    scene = dataclasses.replace(SMALL, devices=3, poses=6, hidden=0.0)
+@pytest.mark.parametrize("devices", [3, 1])
+def test_the_covariance_is_that_of_the_whole_problem(devices: int) -> None:
+    scene = dataclasses.replace(SMALL, devices=devices, poses=6, hidden=0.0, span_deg=25.0)
     board = dataclasses.replace(A4_BOARD, squares_x=5, squares_y=4, square_mm=45.0, marker_mm=30.0)
     truth = make_state(scene, board)
     seen = observe(scene, truth)
@@ -125,6 +127,32 @@ def test_the_covariance_is_that_of_the_whole_problem() -> None:
     found = array_covariance(truth, seen, shape, 0.1)
     assert found is not None
     np.testing.assert_allclose(found.lens_sigma, literal_covariance(truth, seen, 0.1), rtol=2e-3)
+
+
+def test_a_pose_of_one_corner_tells_the_covariance_nothing() -> None:
+    _, solution = solved()
+    used = solution.observations.select(solution.kept)
+    rows = np.flatnonzero(used.pose == 4)
+    without = used.select(used.pose != 4)
+    for few in (1, 2):
+        other = used.select((used.pose != 4) | np.isin(np.arange(len(used)), rows[:few]))
+        one, two = (array_covariance(solution.state, o, FLAT, 0.1) for o in (without, other))
+        assert one is not None
+        assert two is not None
+        np.testing.assert_allclose(one.lens_sigma, two.lens_sigma, rtol=1e-5)
+
+
+@pytest.mark.parametrize("devices", [1, 2])
+def test_few_devices_with_few_poses_are_solved_and_their_deviations_are_honest(
+    devices: int,
+) -> None:
+    scene = dataclasses.replace(SMALL, devices=devices, poses=8, hidden=0.3, span_deg=25.0)
+    truth = make_state(scene)
+    found = solve_array(observe(scene, truth), FLAT, CalibrateSettings(halves=False))
+    assert found.covariance is not None
+    off = [a.fx - b.fx for a, b in zip(found.state.cameras, truth.cameras, strict=True)]
+    assert (np.abs(off) < 4.0 * found.covariance.lens_sigma[:, 0]).all()
+    assert 1.0 < found.held_out.ratio < 3.0  # one corner in one view places the board all the same
 
 
 def test_the_covariance_does_not_depend_on_where_the_world_is() -> None:
@@ -140,7 +168,7 @@ def test_the_covariance_does_not_depend_on_where_the_world_is() -> None:
     assert isinstance(other, ArrayCovariance)
     np.testing.assert_allclose(one.lens_sigma, other.lens_sigma, rtol=1e-5)
     sizes = [np.linalg.norm(c.place_sigma_mm, axis=1) for c in (one, other)]
-    np.testing.assert_allclose(*sizes, rtol=1e-5)
+    np.testing.assert_allclose(sizes[0], sizes[1], rtol=1e-5)
     points = ball_points(np.zeros(3), 60.0, 4)
     motion = rigid_fit(
         np.stack([c.centre for c in solution.state.cameras]),
@@ -150,13 +178,13 @@ def test_the_covariance_does_not_depend_on_where_the_world_is() -> None:
         np.einsum("nii->n", c.triangulation_sigma(p))
         for c, p in ((one, points), (other, motion.apply(points)))
     ]
-    np.testing.assert_allclose(*traces, rtol=1e-5)
+    np.testing.assert_allclose(traces[0], traces[1], rtol=1e-5)
 
 
 def test_stated_deviations_are_true_ones() -> None:
     stated, made, um = [], [], []
     for seed in range(3):
-        scene = dataclasses.replace(SMALL, seed=seed)
+        scene = dataclasses.replace(SMALL, seed=seed, hidden=0.5)
         truth = make_state(scene)
         found = solve_array(observe(scene, truth), FLAT, QUICK)
         assert found.covariance is not None
@@ -205,6 +233,16 @@ def test_the_same_array_elsewhere_projects_alike_and_a_wrong_one_does_not() -> N
     found = projection_difference(truth.cameras, wrong, volume)
     assert max(found.by_device, key=lambda name: found.by_device[name]) == "cam02"
     assert found.by_device["cam02"] > 1.0
+
+
+def test_halves_that_do_not_hang_together_are_not_compared() -> None:
+    _, solution = solved()
+    seen = solution.observations
+    apart = (seen.device < 2) != (seen.pose % 4 < 2)  # in either half two groups never meet
+    halves = split_half(
+        solution.state, seen.select(apart), lambda start, half: start, np.zeros((4, 3)), 1
+    )
+    assert halves.remark == "half of the poses do not tie all devices together"
 
 
 def bar_sightings(cameras: CameraArray, length_mm: float, noise_px: float) -> BarSightings:
@@ -278,6 +316,10 @@ def test_the_world_is_that_of_a_named_frame_or_of_the_previous_session() -> None
     )
     with pytest.raises(TakeError, match=r"cam00 stands where cam03 stood"):
         choose_world(solution, every, QUICK, swapped, 20.0)
+    a_little = ArrayState(before, truth.array_from_board, truth.corners).scaled(0.997).cameras
+    told = choose_world(solution, every, QUICK, a_little, 20.0)
+    assert told is not None
+    assert any(re.search(r"stand 0\.2\d* % further apart", line) for line in told.changes)
     larger = ArrayState(before, truth.array_from_board, truth.corners).scaled(1 / 1.05).cameras
     with pytest.raises(TakeError, match=r"is square_mm = 20 right\? 19\.0"):
         choose_world(solution, every, QUICK, larger, 20.0)

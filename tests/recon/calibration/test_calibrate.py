@@ -17,6 +17,8 @@ from capture.camera_file import read_cameras
 from capture.errors import SettingsError, SolveError, TakeError
 from capture.pose import Pose
 from capture.take import Take
+from recon.board.body import BoardBody
+from recon.board.corner_cache import CornerCache
 from recon.board.corners import CornerLimits
 from recon.board.observations import BoardObservations
 from recon.board.sightings import observe_board
@@ -79,7 +81,8 @@ def test_outliers_are_dropped_and_nothing_else() -> None:
 
 def test_a_flat_solve_of_a_bent_board_is_worse() -> None:
     truth, released = solved(BENT)
-    flat = solve_array(released.observations, CORNERS, CalibrateSettings(free_board=False))
+    held = CalibrateSettings(free_board=False, halves=False, held_out=0.0)
+    flat = solve_array(released.observations, CORNERS, held)
     assert rms_um(truth, flat.state.cameras) > 3.0 * rms_um(truth, released.state.cameras)
 
 
@@ -223,6 +226,7 @@ def test_a_device_out_of_step_is_warned_of() -> None:
         ("focal_guess", 0.0),
         ("image_up", "up"),
         ("held_out", 0.9),
+        ("max_poses", 4),
     ],
 )
 def test_settings_out_of_range_are_refused(key: str, value: object) -> None:
@@ -255,7 +259,8 @@ def test_the_stage_writes_cameras_report_and_record_once(tmp_path: Path) -> None
     report = json.loads(report_path(out).read_text(encoding="utf-8"))
     assert report["mean_reprojection_px"] < 0.1
     assert read_cameras(out).names == take.device_names
-    thinned = observe_board(take, A4_BOARD, CornerLimits(max_poses=3))
+    known = CornerCache(take, BoardBody.of(A4_BOARD))
+    thinned = observe_board(take, A4_BOARD, CornerLimits(max_poses=3), cache=known)
     assert len(thinned.observations.frames) == 3
     assert len(thinned.every.frames) == 7
     spare = sum(counts.get("more poses than needed", 0) for counts in thinned.tally.values())
@@ -266,6 +271,17 @@ def test_the_stage_writes_cameras_report_and_record_once(tmp_path: Path) -> None
     calibrate(take, A4_BOARD, settings, out, progress=lambda done, total, what: steps.append(what))
     assert steps == []  # current: skipped
     assert (out.read_bytes(), out.stat().st_mtime_ns) == before
+    report_path(out).write_text("{}", encoding="utf-8")  # as of another calibration
+    calibrate(take, A4_BOARD, settings, out)
+    assert json.loads(report_path(out).read_text(encoding="utf-8")) == report
+    every = dataclasses.replace(settings, leave_out=take.device_names)
+    with pytest.raises(SettingsError, match="leave_out: names every device"):
+        calibrate(take, A4_BOARD, every, out)
+    framed = dataclasses.replace(settings, world_frame=1)
+    with pytest.raises(SettingsError, match="world_frame = 1 and a previous session"):
+        calibrate(take, A4_BOARD, framed, out, previous=cameras)
+    with pytest.raises(SettingsError, match="that name is taken"):
+        calibrate(take, A4_BOARD, settings, report_path(out))
     with pytest.raises(
         TakeError, match=r"cam00: used the board in 4 frames .* \(4 used, 3 no board\)"
     ):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shutil
 from pathlib import Path
 
 import cv2
@@ -13,6 +14,7 @@ import pytest
 from capture.camera import CameraArray
 from capture.camera_file import write_cameras
 from capture.errors import InputError, SettingsError, TakeError
+from capture.pose import Pose
 from capture.product import record_path
 from capture.take import Take
 from recon.board.body import BoardBody
@@ -214,6 +216,32 @@ def test_cameras_of_another_array_are_noticed(home: Path, tmp_path: Path) -> Non
     )
     with pytest.raises(TakeError, match=r"cam01: the board is .* px from where its camera"):
         calibrate_photometry(wrong, PhotometricSettings(), tmp_path / "photometric.json")
+
+
+def test_another_board_is_told_by_what_the_images_show(home: Path, tmp_path: Path) -> None:
+    other = dataclasses.replace(BIG_BOARD, dictionary="DICT_4X4_100")
+    wrong = dataclasses.replace(sources(home, board=True, flat=False), board=BoardBody.of(other))
+    with pytest.raises(TakeError, match=r"no device sees this board.*all 3 devices.*DICT_5X5"):
+        calibrate_photometry(wrong, PhotometricSettings(), tmp_path / "photometric.json")
+
+
+def test_a_device_that_moved_within_the_take_is_told(home: Path, tmp_path: Path) -> None:
+    moved = tmp_path / "moved"
+    shutil.copytree(home / "board", moved)
+    jolt = Pose.from_rotation_vector(np.radians([0.8, -0.8, 0.0]), np.zeros(3))
+    camera = STATE.cameras[1].posed(jolt @ STATE.cameras[1].camera_from_world)
+    for frame, pose in enumerate(STATE.array_from_board[:3]):
+        radiance = 0.6 * render_board(camera, pose, BIG_BOARD, seed=frame) / 255.0
+        save(moved, camera.name, frame, TRUTH.shown(1, radiance, TOP, 30.0, frame))
+    given = dataclasses.replace(
+        sources(home, board=True, flat=True, dark=False), board_take=taken(moved)
+    )
+    out = tmp_path / "photometric.json"
+    calibrate_photometry(given, PhotometricSettings(black_dn=600.0), out)
+    warnings = json.loads(out.read_text(encoding="utf-8"))["report"]["warnings"]
+    told = [line for line in warnings if "has it moved since it was calibrated?" in line]
+    assert len(told) == 1
+    assert told[0].startswith("cam01: in 3 of 7 views the board is more than 2 px from where")
 
 
 def test_dark_frames_and_clipped_fields(home: Path, tmp_path: Path) -> None:

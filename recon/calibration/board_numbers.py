@@ -24,7 +24,8 @@ def board_numbers(solution: ArraySolution, names: Sequence[str]) -> dict[str, An
     Returns:
         `shape_solved`; corners seen and there; `bow_mm` (from the lowest to the highest corner over
         the best plane), `flatness_rms_mm` and `width_over_height` of the worst face; `faces`: the
-        same for each. Null where a face showed too few corners.
+        same for each, and `in_plane_rms_mm`: how far the corners lie beside their nominal places
+        in the plane, stretch taken out. Null where a face showed too few corners.
     """
     faces = [_face(solution, index, name) for index, name in enumerate(names)]
     known = [face for face in faces if face["bow_mm"] is not None]
@@ -51,6 +52,7 @@ def _face(solution: ArraySolution, index: int, name: str) -> dict[str, Any]:
         "bow_mm": None,
         "flatness_rms_mm": None,
         "width_over_height": None,
+        "in_plane_rms_mm": None,
     }
     if len(seen) < _LEAST_CORNERS:
         return numbers
@@ -64,4 +66,6 @@ def _face(solution: ArraySolution, index: int, name: str) -> dict[str, Any]:
     if rank == 2:
         lengths = np.linalg.norm(flat, axis=1)
         numbers["width_over_height"] = number(lengths[0] / lengths[1])
+        astray = (centred - (nominal - nominal.mean(axis=0)) @ flat) @ axes[:2].T
+        numbers["in_plane_rms_mm"] = number(np.sqrt((astray**2).sum(axis=1).mean()))
     return numbers

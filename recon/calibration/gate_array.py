@@ -224,6 +224,12 @@ def _board(report: Mapping[str, Any], settings: GateSettings) -> Finding | None:
             words.append(
                 f"the squares of {name} are {ratio:.4f} times as wide as high: measure both ways"
             )
+        astray = number_at(face, "in_plane_rms_mm")
+        if astray > settings.astray_mm:
+            words.append(
+                f"the corners of {name} lie {astray:.2f} mm (rms) beside the places that its file "
+                "gives them: is it the file of this board?"
+            )
     if board.get("shape_solved") is False:
         words.append(
             "the shape of the board was not solved for, so that a bent one would not show: let it "

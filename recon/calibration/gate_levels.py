@@ -58,6 +58,8 @@ class GateSettings:
         usable_scale: 0.2 mm on a head of 200 mm is more than all other errors together.
         bow_mm: a board bent further will not keep its shape while it is waved.
         stretch: squares wider than high by this are a printer's fault, or a wrong board file.
+        astray_mm: corners further beside their places (rms, stretch taken out) than any print puts
+            them are those of another board.
         most_reasons: in the list, so that it is read.
         most_poses: asked for; when more are needed, something else is wrong.
     """
@@ -88,6 +90,7 @@ class GateSettings:
     usable_scale: float = 2e-3
     bow_mm: float = 1.0
     stretch: float = 1e-3
+    astray_mm: float = 0.15
     most_reasons: int = 12
     most_poses: int = 60
 

@@ -21,6 +21,7 @@ from recon.calibration.chosen_world import choose_world
 from recon.calibration.covariance import ArrayCovariance, array_covariance
 from recon.calibration.gauge import board_scale, flat_places, regauged
 from recon.calibration.geometry import ball_points, rigid_fit, triangulate
+from recon.calibration.report import calibration_report
 from recon.calibration.scale_bar import measure_bar
 from recon.calibration.solver import ArraySolution, CalibrateSettings, solve_array
 from recon.calibration.split_half import projection_difference, split_half
@@ -243,6 +244,20 @@ def test_halves_that_do_not_hang_together_are_not_compared() -> None:
         solution.state, seen.select(apart), lambda start, half: start, np.zeros((4, 3)), 1
     )
     assert halves.remark == "half of the poses do not tie all devices together"
+
+
+def test_a_board_that_is_not_that_of_its_file_is_asked_about() -> None:
+    truth, _ = solved()
+    nominal = A4_BOARD.corners_mm()
+    other = nominal.copy()
+    other[:, 0] += np.where((np.arange(len(other)) % 11) % 2, 0.5, -0.5)  # uneven columns, mm
+    seen = observe(SMALL, ArrayState(truth.cameras, truth.array_from_board, other))
+    report = calibration_report(solve_array(seen, FLAT, QUICK), A4_BOARD)
+    assert report["board"]["faces"][0]["in_plane_rms_mm"] == pytest.approx(0.5, abs=0.02)
+    words = " ".join(reason["words"] for reason in report["gate"]["reasons"])
+    assert "is it the file of this board?" in words
+    straight = calibration_report(solved()[1], A4_BOARD)
+    assert straight["board"]["faces"][0]["in_plane_rms_mm"] < 0.02
 
 
 def bar_sightings(cameras: CameraArray, length_mm: float, noise_px: float) -> BarSightings:

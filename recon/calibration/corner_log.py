@@ -11,6 +11,7 @@ import numpy as np
 
 from capture.arrays import Bools
 from capture.product import replacing
+from recon.calibration.device_numbers import number
 from recon.calibration.solver import ArraySolution
 
 BEHIND = "behind the camera"
@@ -64,17 +65,20 @@ def rejection_reasons(solution: ArraySolution) -> list[str]:
 def rejection_summary(solution: ArraySolution) -> dict[str, Any]:
     """How many sightings were dropped, by reason, by device and by frame, for JSON.
 
-    Of a device also how many of its views were off as a whole; of the frames only those in which
-    anything was dropped.
+    Of a device also by how much (median, px; null when nothing or behind the camera) and how many
+    of its views were off as a whole; of the frames only those in which anything was dropped.
     """
     seen, dropped = solution.observations, ~solution.kept
     off = _in_whole_views(solution)
+    size = np.linalg.norm(solution.residuals, axis=1)
     devices = {}
     for index, name in enumerate(seen.device_names):
         mine = seen.device == index
+        gone = int((mine & dropped).sum())
         devices[name] = {
-            "rejected": int((mine & dropped).sum()),
+            "rejected": gone,
             "of": int(mine.sum()),
+            "median_px": number(np.median(size[mine & dropped])) if gone else None,
             "whole_views": len(np.unique(seen.pose[mine & off])),
             "views": len(np.unique(seen.pose[mine])),
         }

@@ -65,6 +65,9 @@ def fault_findings(
         if share > settings.good_rejected:
             facts["rejected"] = share
             levels.append(settings.level(share, settings.good_rejected, settings.usable_rejected))
+            off = number_at(part_of(views, row["name"]), "median_px")
+            if off < settings.slight_px:
+                facts["slight"] = off
         same_way = _systematic(row, noise) * noise
         whole = number_at(part_of(views, row["name"]), "whole_views")
         if same_way > settings.systematic * max(noise, _OF_RESIDUAL * ratio * usual):
@@ -223,6 +226,7 @@ def _fault(group: Sequence[_Case], usual: float, settings: GateSettings) -> Find
         "residual": f"residual {_range(group, 'residual', '{:.2f}')} px where {usual:.2f} px is "
         "usual here",
         "rejected": f"{_range(group, 'rejected', '{:.0f}', 100.0)} % of the corners dropped",
+        "slight": f"off by {_range(group, 'slight', '{:.1f}')} px",
         "whole": f"{_range(group, 'whole', '{:.0f}')} whole views do not fit the other devices",
         "systematic": f"residuals of {_range(group, 'systematic', '{:.2f}')} px that point the "
         "same way in parts of the image",
@@ -231,6 +235,8 @@ def _fault(group: Sequence[_Case], usual: float, settings: GateSettings) -> Find
     asked = "is its lens sharp and tight, and nothing before it?"
     if "whole" in group[0].facts:
         asked = "was it triggered with the others, and did it stay in its place?"
+    if "slight" in group[0].facts:
+        asked = "a board seen at a slant or a little blurred does that: tilt it less, hold it still"
     if "systematic" in group[0].facts:
         asked = "the lens model does not fit; is there glass before it, or did zoom or focus move?"
     return Finding(

@@ -60,6 +60,7 @@ class GateSettings:
         stretch: squares wider than high by this are a printer's fault, or a wrong board file.
         astray_mm: corners further beside their places (rms, stretch taken out) than any print puts
             them are those of another board.
+        slight_px: dropped corners off by less than this (median) were found badly, not misplaced.
         most_reasons: in the list, so that it is read.
         most_poses: asked for; when more are needed, something else is wrong.
     """
@@ -91,6 +92,7 @@ class GateSettings:
     bow_mm: float = 1.0
     stretch: float = 1e-3
     astray_mm: float = 0.15
+    slight_px: float = 1.5
     most_reasons: int = 12
     most_poses: int = 60
 

@@ -19,6 +19,7 @@ from recon.board.shape import BoardShape
 from recon.board.sightings import BarSightings
 from recon.calibration.chosen_world import choose_world
 from recon.calibration.covariance import ArrayCovariance, array_covariance
+from recon.calibration.gate import judge_calibration
 from recon.calibration.gauge import board_scale, flat_places, regauged
 from recon.calibration.geometry import ball_points, rigid_fit, triangulate
 from recon.calibration.report import calibration_report
@@ -258,6 +259,18 @@ def test_a_board_that_is_not_that_of_its_file_is_asked_about() -> None:
     assert "is it the file of this board?" in words
     straight = calibration_report(solved()[1], A4_BOARD)
     assert straight["board"]["faces"][0]["in_plane_rms_mm"] < 0.02
+
+
+def test_corners_a_little_off_are_no_fault_of_the_trigger() -> None:
+    report = calibration_report(solved()[1], A4_BOARD)
+    device, views = report["devices"][1], report["rejected"]["devices"]["cam01"]
+    device["corners_rejected"] = device["corners_used"] // 8
+    views.update(whole_views=2, median_px=0.8)
+    slight = judge_calibration(report)["reasons"]
+    assert any("off by 0.8 px" in r["words"] and "at a slant" in r["words"] for r in slight)
+    views["median_px"] = 30.0
+    grave = judge_calibration(report)["reasons"]
+    assert any("was it triggered with the others" in r["words"] for r in grave)
 
 
 def bar_sightings(cameras: CameraArray, length_mm: float, noise_px: float) -> BarSightings:

@@ -184,7 +184,7 @@ def renamed(cameras: CameraArray, names: list[str]) -> CameraArray:
     return CameraArray(tuple(dataclasses.replace(camera, name=name) for camera, name in pairs))
 
 
-@pytest.mark.parametrize("by", [2, 3])
+@pytest.mark.parametrize("by", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_cameras_of_other_devices_end_in_words(by: int) -> None:
     cameras = truth_of(SCENE).cameras
     turned = renamed(cameras, [*cameras.names[by:], *cameras.names[:by]])

@@ -46,7 +46,13 @@ def test_a_healthy_take_is_not_refused() -> None:
     solve(video()[1])
 
 
-@pytest.mark.parametrize(("frames", "told"), [(20, "20 frames late"), (-7, "7 frames early")])
+@pytest.mark.parametrize(
+    ("frames", "told"),
+    [
+        (20, "20 frames late"),
+        pytest.param(-7, "7 frames early", marks=pytest.mark.slow),
+    ],
+)
 def test_a_device_out_of_step_is_named_with_its_frames(frames: int, told: str) -> None:
     with pytest.raises(TakeError) as caught:
         solve(delay_device(video()[1], 4, frames))

@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 
 from capture.camera import Camera, CameraArray
-from capture.documents import read_json
+from capture.documents import key_problems, read_json
 from capture.errors import CameraError, LikenessError, raise_all
-from capture.names import is_plain_name, known_hint
+from capture.names import is_plain_name
 from capture.pose import Pose
 from capture.product import replacing
 
@@ -55,7 +55,7 @@ def cameras_from_document(document: Any, where: str) -> CameraArray:
         raise CameraError(
             f"{where}: expected an object with 'cameras', found {type(document).__name__}"
         )
-    problems = _key_problems(document, ("units", "cameras"), _TOP, "top level")
+    problems = key_problems(document, ("units", "cameras"), _TOP, "top level")
     raise_all(where, problems, CameraError)
     if document["units"] != "mm":
         raise CameraError(f'{where}: units must be "mm", found {document["units"]!r}')
@@ -112,7 +112,7 @@ def _camera(entry: Any, index: int) -> Camera:
     if not isinstance(entry, Mapping):
         raise CameraError(f"camera {index}: expected an object, found {type(entry).__name__}")
     label = str(entry.get("name", f"camera {index}"))
-    raise_all(label, _key_problems(entry, _REQUIRED, _REQUIRED + _OPTIONAL, "camera"), CameraError)
+    raise_all(label, key_problems(entry, _REQUIRED, _REQUIRED + _OPTIONAL, "camera"), CameraError)
     if not is_plain_name(entry["name"]):
         raise CameraError(
             f"camera {index}: name must be letters, digits, '-', '_' or '.', "
@@ -154,13 +154,3 @@ def _numbers(
     if not np.isfinite(array).all():
         raise CameraError(f"{label}: {key} holds NaN or infinity: {array.tolist()}")
     return array
-
-
-def _key_problems(
-    found: Mapping[str, Any], required: tuple[str, ...], known: tuple[str, ...], what: str
-) -> list[str]:
-    problems = [f"{what}: missing key {key!r}" for key in required if key not in found]
-    for key in found:
-        if key not in known:
-            problems.append(f"{what}: unknown key {key!r}; {known_hint(key, known)}")
-    return problems

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from capture.errors import InputError
+from capture.names import known_hint
 
 _FAULTS = (OSError, ValueError, RecursionError)
 """Unreadable; not text, not that language, a number of too many digits; nested without end."""
@@ -31,6 +32,24 @@ def read_json(path: Path, kind: type[InputError] = InputError, *, absent: str = 
 def read_toml(path: Path, kind: type[InputError] = InputError, *, absent: str = "") -> Any:
     """The parsed TOML of a file; arguments and errors as of `read_json`."""
     return _read(path, tomllib.loads, "TOML", kind, absent)
+
+
+def key_problems(
+    found: Mapping[str, Any], required: tuple[str, ...], known: tuple[str, ...], what: str
+) -> list[str]:
+    """Keys that an object of a strict file lacks, and those that it must not have, in words.
+
+    Args:
+        found: the object as parsed.
+        required: keys it must have.
+        known: keys it may have.
+        what: the name of the object in the words.
+    """
+    problems = [f"{what}: missing key {key!r}" for key in required if key not in found]
+    for key in found:
+        if key not in known:
+            problems.append(f"{what}: unknown key {key!r}; {known_hint(key, known)}")
+    return problems
 
 
 def _read(

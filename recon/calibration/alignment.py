@@ -12,12 +12,12 @@ from capture.arrays import Bools, Floats
 from capture.camera import Camera, CameraArray
 from capture.errors import CameraError
 from capture.pose import Pose
+from recon.calibration.geometry import nearest_to_axes, rigid_fit
 
 _FEWEST = 3  # devices that both sessions know
 _STEPS = 30
 _TUKEY = 4.685
 _MAD = 1.4826
-_CONVERGING = 0.02  # least eigenvalue of the mean projector across the axes
 _BALL = 0.12  # radius of the compared volume over the working distance
 _CHANGED_PX, _CHANGED_TIMES = 0.5, 5.0  # a device is named beyond both
 _SCALED = 5e-4  # a change of scale worth a word
@@ -109,6 +109,32 @@ def align_to_previous(found: CameraArray, previous: CameraArray) -> Alignment:
     )
 
 
+def size_words(alignment: Alignment, square_mm: float | None = None) -> list[str]:
+    """That the whole array has another size than before, in a line, if it has."""
+    off = alignment.scale - 1.0
+    if abs(off) <= max(_SCALED, _SURE * alignment.scale_sigma):
+        return []
+    way = "further" if off > 0 else "less far"
+    ask = "is the size of the board in its file right?"
+    if square_mm is not None:
+        ask = f"is square_mm = {square_mm:.5g} right? {square_mm / alignment.scale:.4g} would fit"
+    return [
+        f"all devices stand {100 * abs(off):.2g} % {way} apart than in the previous session: {ask}"
+    ]
+
+
+def exchange_words(alignment: Alignment) -> list[str]:
+    """Which devices stand where others stood, a line each exchange."""
+    lines = []
+    for cycle in alignment.swapped:
+        stands = ", and ".join(
+            f"{a} {'stands ' if i == 0 else ''}where {b} stood"
+            for i, (a, b) in enumerate(zip(cycle, (*cycle[1:], cycle[0]), strict=True))
+        )
+        lines.append(f"{stands}: {_cause(alignment.lens_went_along[cycle[0]])}")
+    return lines
+
+
 def alignment_problems(alignment: Alignment, square_mm: float | None = None) -> list[str]:
     """What an operator should look at, one line each; empty when the sessions agree.
 
@@ -116,26 +142,8 @@ def alignment_problems(alignment: Alignment, square_mm: float | None = None) -> 
         alignment: of the two sessions.
         square_mm: side of the board's squares in its file, to tell which one would fit.
     """
-    lines = []
-    off = alignment.scale - 1.0
-    if abs(off) > max(_SCALED, _SURE * alignment.scale_sigma):
-        way = "further" if off > 0 else "less far"
-        ask = "is the size of the board in its file right?"
-        if square_mm is not None:
-            ask = (
-                f"is square_mm = {square_mm:.5g} right? {square_mm / alignment.scale:.4g} would fit"
-            )
-        lines.append(
-            f"all devices stand {100 * abs(off):.2g} % {way} apart than in the previous session: "
-            f"{ask}"
-        )
+    lines = [*size_words(alignment, square_mm), *exchange_words(alignment)]
     exchanged = {name for cycle in alignment.swapped for name in cycle}
-    for cycle in alignment.swapped:
-        stands = ", and ".join(
-            f"{a} {'stands ' if i == 0 else ''}where {b} stood"
-            for i, (a, b) in enumerate(zip(cycle, (*cycle[1:], cycle[0]), strict=True))
-        )
-        lines.append(f"{stands}: {_cause(alignment.lens_went_along[cycle[0]])}")
     typical = float(np.median(list(alignment.effect_px.values())))
     limit = max(_CHANGED_PX, _CHANGED_TIMES * typical)
     for name, (shift_mm, turn_deg) in alignment.moved.items():
@@ -173,11 +181,9 @@ def _centres(cameras: Sequence[Camera]) -> Floats:
 def _meeting_point(cameras: Sequence[Camera]) -> Floats | None:
     """The point nearest to all optical axes, or None where they do not converge."""
     centres, axes = _centres(cameras), _axes(cameras)
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    total = across.sum(axis=0)
-    if np.linalg.eigvalsh(total / len(axes))[0] < _CONVERGING:
+    point = nearest_to_axes(centres, axes)
+    if point is None:
         return None
-    point: Floats = np.linalg.solve(total, (across @ centres[:, :, None]).sum(axis=0))[:, 0]
     ahead = np.einsum("ci,ci->c", point - centres, axes) > 0
     return point if ahead.mean() > 0.5 else None
 
@@ -243,7 +249,7 @@ def _align(
     """Motion previous_from_found of lengths divided by `scale`, and which devices kept to it."""
     one, other = _points(now, scale, reach), _points(then, 1.0, reach)
     if only is not None:
-        return _kabsch(one, other, only.astype(np.float64)), only
+        return _fitted(one, other, only.astype(np.float64)), only
     best, least = Pose.identity(), np.inf
     for a, b in zip(now, then, strict=True):
         rotation = b.camera_from_world.rotation.T @ a.camera_from_world.rotation
@@ -258,7 +264,7 @@ def _align(
         half = np.sort(miss)[: len(miss) // 2 + 1]
         width = _TUKEY * _MAD * max(float(half[-1]), 1e-9 * reach)
         weight = np.clip(1.0 - (miss / width) ** 2, 0.0, None) ** 2
-        motion = _kabsch(one, other, weight)
+        motion = _fitted(one, other, weight)
     return motion, weight > 0
 
 
@@ -269,15 +275,9 @@ def _misses(motion: Pose, one: Floats, other: Floats) -> Floats:
     return size
 
 
-def _kabsch(one: Floats, other: Floats, weight: Floats) -> Pose:
+def _fitted(one: Floats, other: Floats, weight: Floats) -> Pose:
     """Rigid motion other_from_one of point sets (C, 3, 3) with weights (C,) of their owners."""
-    share = np.repeat(weight, 3) / (3.0 * weight.sum())
-    a, b = one.reshape(-1, 3), other.reshape(-1, 3)
-    middle_a, middle_b = share @ a, share @ b
-    u, _, vt = np.linalg.svd(((b - middle_b) * share[:, None]).T @ (a - middle_a))
-    u[:, 2] *= np.linalg.det(u @ vt)
-    rotation = u @ vt
-    return Pose(rotation, middle_b - rotation @ middle_a)
+    return rigid_fit(one.reshape(-1, 3), other.reshape(-1, 3), np.repeat(weight, 3))
 
 
 def _in_previous(camera: Camera, motion: Pose, scale: float) -> Camera:

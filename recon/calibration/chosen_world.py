@@ -10,13 +10,17 @@ import numpy as np
 from capture.camera import CameraArray
 from capture.errors import TakeError, raise_all
 from recon.board.observations import BoardObservations
-from recon.calibration.alignment import align_to_previous, alignment_problems
+from recon.calibration.alignment import (
+    align_to_previous,
+    alignment_problems,
+    exchange_words,
+    size_words,
+)
 from recon.calibration.board_places import place_boards
 from recon.calibration.solver import ArraySolution, CalibrateSettings
 from recon.calibration.world import ArrayWorld, world_from_board_pose
 
 _OTHER_SIZE = 5e-3  # a scale further off refuses; arrays of three or four differ by up to 0.2 %
-_EXCHANGED, _SCALED = "stands where", "apart than in the previous session"
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,14 +59,14 @@ def choose_world(
     """
     if previous is not None:
         alignment = align_to_previous(solution.state.cameras, previous)
-        lines = alignment_problems(alignment, square_mm)
-        other_size = abs(alignment.scale - 1.0) > _OTHER_SIZE
-        grave = [line for line in lines if _EXCHANGED in line or (other_size and _SCALED in line)]
+        grave = exchange_words(alignment)
+        if abs(alignment.scale - 1.0) > _OTHER_SIZE:
+            grave = [*size_words(alignment, square_mm), *grave]
         raise_all("the array is not that of the previous session", grave, TakeError)
         world = ArrayWorld(
             alignment.world_from_array, "that of the previous session", "that of the same"
         )
-        return ChosenWorld(world, tuple(lines))
+        return ChosenWorld(world, tuple(alignment_problems(alignment, square_mm)))
     if settings.world_frame is None:
         return None
     frames = list(every.frames)

@@ -19,6 +19,7 @@ from capture.camera import Camera, CameraArray
 from recon.array_state import ArrayState
 from recon.board.observations import BoardObservations
 from recon.board.shape import BoardShape
+from recon.calibration.geometry import rigid_basis
 
 LENS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
 _LENS = len(LENS)
@@ -99,9 +100,9 @@ class ArrayCovariance:
         good = np.isfinite(moved).all(axis=(1, 2))
         shift = self._moved(points)
         if good.any():
-            rigid = _rigid_basis(reference[good]).reshape(-1, _RIGID)
+            rigid = rigid_basis(reference[good]).reshape(-1, _RIGID)
             motion, _, _, _ = np.linalg.lstsq(rigid, moved[good].reshape(len(rigid), -1), None)
-            shift = shift - _rigid_basis(points) @ motion
+            shift = shift - rigid_basis(points) @ motion
         covariance: Floats = shift @ shift.transpose(0, 2, 1)
         return covariance
 
@@ -126,7 +127,7 @@ class ArrayCovariance:
             if not len(seen):
                 continue
             by_point = slopes[index][seen]
-            by_place = by_point @ _rigid_basis(points[seen])
+            by_place = by_point @ rigid_basis(points[seen])
             lens = self.root[_LENS * index : _LENS * (index + 1)]
             first = _LENS * count + _RIGID * index
             place = self.root[first : first + _RIGID]
@@ -140,7 +141,7 @@ class ArrayCovariance:
         count = len(self.cameras)
         rows = self.root[_LENS * count : (_LENS + _RIGID) * count].reshape(count, _RIGID, -1)
         centres = np.stack([camera.centre for camera in self.cameras])
-        rigid = -_rigid_basis(centres).reshape(-1, _RIGID)
+        rigid = -rigid_basis(centres).reshape(-1, _RIGID)
         scaled = rigid / np.maximum(np.linalg.norm(rigid, axis=0), 1e-12)
         if np.linalg.svd(scaled, compute_uv=False)[-1] < 1e-3:
             return rows  # centres on one line do not fix the turn about it
@@ -205,7 +206,7 @@ def _reduced_normal(
         rows = observations.device == index
         lens[rows] = lens_jacobian(camera, points[rows])
         moved[rows] = camera.project_jacobian(points[rows])
-    rigid = moved @ _rigid_basis(points)
+    rigid = moved @ rigid_basis(points)
     turns = np.stack([pose.rotation for pose in state.array_from_board])[observations.pose]
     start = (_LENS + _RIGID) * count
     width = start + 3 * len(free)
@@ -261,7 +262,7 @@ def _gauge(state: ArrayState, shape: BoardShape | None, free: Ints) -> tuple[Flo
         return array, _rows_on(array)
     corners = state.corners[free]
     board = np.zeros((width, _RIGID))
-    board[start:] = _rigid_basis(corners - corners.mean(axis=0)).reshape(-1, _RIGID)
+    board[start:] = rigid_basis(corners - corners.mean(axis=0)).reshape(-1, _RIGID)
     scale = np.zeros((width, 1))
     for index, camera in enumerate(state.cameras):
         first = _LENS * count + _RIGID * index
@@ -281,21 +282,10 @@ def _rows_on(columns: Floats) -> Floats:
     return sized
 
 
-def _rigid_basis(points: Floats) -> Floats:
-    """Motion (N, 3, 6) of points by a small turn, radians, about the origin and a shift."""
-    out = np.zeros((len(points), 3, _RIGID))
-    x, y, z = points.T
-    out[:, 0, 1], out[:, 0, 2] = z, -y
-    out[:, 1, 0], out[:, 1, 2] = -z, x
-    out[:, 2, 0], out[:, 2, 1] = y, -x
-    out[:, :, 3:] = np.eye(3)
-    return out
-
-
 def _centre_shifts(cameras: CameraArray, motions: Floats) -> Floats:
     """Shifts (C, 3, r) of the centres by turns and shifts (C, 6, r) of the world before them."""
     centres = np.stack([camera.centre for camera in cameras])
-    moved: Floats = -_rigid_basis(centres) @ motions
+    moved: Floats = -rigid_basis(centres) @ motions
     return moved
 
 

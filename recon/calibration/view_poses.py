@@ -12,6 +12,7 @@ from capture.arrays import Bools, Floats, check_shape
 from capture.camera import Camera, CameraArray
 from capture.pose import Pose
 from recon.board.observations import BoardObservations
+from recon.calibration.geometry import rigid_basis
 
 _THIN = 0.02  # thickness over extent of corners that count as flat
 _ONE_LINE = 1e-3
@@ -146,7 +147,7 @@ def rigid_columns(points: Floats, by_point: Floats) -> Floats:
         by_point: (M, 2, 3) derivative of the pixels by the point, px per mm.
     """
     check_shape(points=(points, "M 3"), by_point=(by_point, "M 2 3"))
-    turned: Floats = np.concatenate([np.cross(points[:, None, :], by_point), by_point], axis=2)
+    turned: Floats = by_point @ rigid_basis(points)
     return turned
 
 

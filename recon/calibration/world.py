@@ -11,6 +11,7 @@ from capture.camera import CameraArray
 from capture.errors import SettingsError
 from capture.pose import Pose
 from recon.board.shape import BoardShape
+from recon.calibration.geometry import nearest_to_axes
 
 IMAGE_UP: dict[str, tuple[float, float, float]] = {
     "top": (0.0, -1.0, 0.0),
@@ -22,9 +23,6 @@ BOARD_STANDS: dict[str, tuple[tuple[int, int, int], ...]] = {  # world axes in t
     "upright": ((1, 0, 0), (0, -1, 0), (0, 0, -1)),
     "lying": ((1, 0, 0), (0, 0, -1), (0, 1, 0)),
 }
-_CONVERGING = (
-    0.02  # least eigenvalue of the mean projector across the axes: about 8 degrees of spread
-)
 _AGREEING = 0.3  # length of the mean of the devices' up directions that still means anything
 
 
@@ -108,12 +106,10 @@ def world_from_board_pose(
 
 
 def _origin(centres: Floats, axes: Floats, board_centres: Floats) -> tuple[Floats, str]:
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    total = across.sum(axis=0)
     middle = board_centres.mean(axis=0)
-    if np.linalg.eigvalsh(total / len(axes))[0] < _CONVERGING:
+    nearest = nearest_to_axes(centres, axes)
+    if nearest is None:
         return middle, "centroid of the board's places: the optical axes do not converge"
-    nearest: Floats = np.linalg.solve(total, (across @ centres[:, :, None]).sum(axis=0))[:, 0]
     reach = float(np.median(np.linalg.norm(centres - middle, axis=1)))
     if np.linalg.norm(nearest - middle) > 0.5 * reach:
         return middle, "centroid of the board's places: the optical axes meet far from them"

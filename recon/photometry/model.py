@@ -31,9 +31,9 @@ from typing import Any
 import numpy as np
 
 from capture.arrays import Floats, Floats32, Image, Ints, check_finite, check_shape
-from capture.documents import read_json
+from capture.documents import key_problems, read_json
 from capture.errors import InputError, LikenessError, ShapeError, raise_all
-from capture.names import is_plain_name, known_hint
+from capture.names import is_plain_name
 from capture.product import replacing
 
 FORMAT = 1
@@ -272,7 +272,7 @@ def read_photometry(path: Path) -> PhotometricModel:
         raise InputError(
             f"{path}: expected an object with 'devices', found {type(document).__name__}"
         )
-    raise_all(str(path), _key_problems(document, _TOP[:3], _TOP, "top level"))
+    raise_all(str(path), key_problems(document, _TOP[:3], _TOP, "top level"))
     if document["format"] != FORMAT:
         raise InputError(f"{path}: format must be {FORMAT}, found {document['format']!r}")
     entries = document["devices"]
@@ -295,7 +295,7 @@ def read_photometry(path: Path) -> PhotometricModel:
 def _device(entry: Any, index: int) -> DevicePhotometry:
     if not isinstance(entry, Mapping):
         raise InputError(f"device {index}: expected an object, found {type(entry).__name__}")
-    raise_all(f"device {index}", _key_problems(entry, _KEYS, _KEYS, "device"))
+    raise_all(f"device {index}", key_problems(entry, _KEYS, _KEYS, "device"))
     name = entry["name"]
     if not is_plain_name(name):
         raise InputError(
@@ -342,13 +342,3 @@ def _lowest(device: DevicePhotometry) -> float:
     x, y = (np.linspace(0.0, size - 1.0, 33) for size in (device.width, device.height))
     grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     return float(device.falloff(grid).min())
-
-
-def _key_problems(
-    found: Mapping[str, Any], required: tuple[str, ...], known: tuple[str, ...], what: str
-) -> list[str]:
-    problems = [f"{what}: missing key {key!r}" for key in required if key not in found]
-    for key in found:
-        if key not in known:
-            problems.append(f"{what}: unknown key {key!r}; {known_hint(key, known)}")
-    return problems

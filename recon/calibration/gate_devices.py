@@ -222,12 +222,14 @@ def _gap_advice(group: Sequence[_Case]) -> str:
 
 
 def _fault(group: Sequence[_Case], usual: float, settings: GateSettings) -> Finding:
+    whole = _range(group, "whole", "{:.0f}")
+    views = "view does" if whole == "1" else "views do"
     words = {
         "residual": f"residual {_range(group, 'residual', '{:.2f}')} px where {usual:.2f} px is "
         "usual here",
         "rejected": f"{_range(group, 'rejected', '{:.0f}', 100.0)} % of the corners dropped",
         "slight": f"off by {_range(group, 'slight', '{:.1f}')} px",
-        "whole": f"{_range(group, 'whole', '{:.0f}')} whole views do not fit the other devices",
+        "whole": f"{whole} whole {views} not fit the other devices",
         "systematic": f"residuals of {_range(group, 'systematic', '{:.2f}')} px that point the "
         "same way in parts of the image",
     }

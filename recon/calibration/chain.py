@@ -24,7 +24,7 @@ _CAP = 0.1  # a relative pose off by more than this (radians, or fraction of dis
 
 
 @dataclass(frozen=True, eq=False)
-class _View:
+class BoardView:
     """One device's sight of the board at one pose: the poses IPPE offers, best first, by face."""
 
     device: int
@@ -102,7 +102,7 @@ def first_guess(
     lenses = nominal_lenses(observations, shape, focal_guess)
     groups = _groups(shape)
     apart, poses = _apart(observations, shape, groups)
-    views = _pose_candidates(apart, shape, lenses)
+    views = view_candidates(apart, shape, lenses)
     links = _link(apart, views)
     parent, order = _spanning_tree(apart, links)
     camera_from_array = {order[0]: Pose.identity()}
@@ -198,9 +198,16 @@ def _joined(
     return ArrayState(apart.cameras, tuple(motions), corners)
 
 
-def _pose_candidates(
+def view_candidates(
     observations: BoardObservations, shape: BoardShape, lenses: list[Camera]
-) -> list[_View]:
+) -> list[BoardView]:
+    """Poses of the body that each view of it allows.
+
+    Args:
+        observations: corner sightings.
+        shape: the board; of a face whose place is not known the pose is its own.
+        lenses: one a device; their places are not used.
+    """
     body_from_face = [
         rigid_fit(
             np.concatenate([flat, np.zeros((len(flat), 1))], axis=1), shape.corners[shape.face == f]
@@ -219,7 +226,7 @@ def _pose_candidates(
                 found = plane_poses(flat, ideal[seen])
                 candidates += [option @ body_from_face[face].inverse() for option in found]
         if candidates:
-            views.append(_View(device, pose, tuple(candidates), rows.stop - rows.start))
+            views.append(BoardView(device, pose, tuple(candidates), rows.stop - rows.start))
     return views
 
 
@@ -248,10 +255,10 @@ def plane_poses(flat: Floats, ideal: Floats) -> list[Pose]:
     return out
 
 
-def _link(observations: BoardObservations, views: list[_View]) -> Links:
+def _link(observations: BoardObservations, views: list[BoardView]) -> Links:
     """Compare the devices two by two on the board poses both saw."""
     count = len(observations.device_names)
-    places: list[dict[int, _View]] = [{} for _ in range(count)]
+    places: list[dict[int, BoardView]] = [{} for _ in range(count)]
     for view in views:
         places[view.device][view.pose] = view
     relative: dict[tuple[int, int], Pose] = {}
@@ -262,7 +269,7 @@ def _link(observations: BoardObservations, views: list[_View]) -> Links:
             both = sorted(places[one].keys() & places[other].keys())
             if not both:
                 continue
-            best, near = _shared_motion(
+            best, near = shared_motion(
                 [places[one][pose].candidates for pose in both],
                 [places[other][pose].candidates for pose in both],
             )
@@ -296,7 +303,7 @@ def _spanning_tree(
     return parent, order
 
 
-def _shared_motion(
+def shared_motion(
     ones: list[tuple[Pose, ...]], others: list[tuple[Pose, ...]]
 ) -> tuple[Pose, Bools]:
     """The motion one_from_other that most pairs of candidate poses offer, and which pairs do."""
@@ -346,12 +353,12 @@ def board_poses(
         shape: the board, every face of it placed.
         cameras: the array.
     """
-    views = _pose_candidates(observations, shape, list(cameras))
+    views = view_candidates(observations, shape, list(cameras))
     return _board_poses(observations, shape.corners, cameras, views)
 
 
 def _board_poses(
-    observations: BoardObservations, corners: Floats, cameras: CameraArray, views: list[_View]
+    observations: BoardObservations, corners: Floats, cameras: CameraArray, views: list[BoardView]
 ) -> tuple[Pose, ...]:
     """For each board pose, the candidate of any device that all devices together like best."""
     rows_of = [np.flatnonzero(observations.pose == p) for p in range(len(observations.frames))]

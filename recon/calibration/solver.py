@@ -19,6 +19,7 @@ from recon.board.view_check import check_upright, check_views
 from recon.calibration.board_places import place_boards
 from recon.calibration.chain import first_guess
 from recon.calibration.covariance import ArrayCovariance, array_covariance
+from recon.calibration.exchanged import find_exchange
 from recon.calibration.faults import odd_devices
 from recon.calibration.gauge import regauged
 from recon.calibration.geometry import ball_points
@@ -251,6 +252,10 @@ def _look_into(
     Raises:
         TakeError: naming every one of them that does not fit the others.
     """
+    lenses = nominal_lenses(observations, shape, settings.focal_guess)
+    exchange = find_exchange(lenses, every, shape)
+    if exchange is not None:
+        raise TakeError(f"{_APART}: {exchange.words(observations.device_names)}")
     odd = list(odd)
     for _ in range(_MOST_ODD):
         fine = [c for c in range(len(observations.device_names)) if c not in odd]
@@ -262,7 +267,6 @@ def _look_into(
         if not poor or 2 * len(odd) >= len(fine):
             break
         odd.append(fine[poor[0]])
-    lenses = nominal_lenses(observations, shape, settings.focal_guess)
     said = explain_suspects(found.state, lenses, every, sigma, shape)
     raise_all(_APART, list(dict.fromkeys(said.values())), TakeError)
 

@@ -13,10 +13,12 @@ from capture.errors import TakeError
 from capture.pose import Pose
 from recon.array_state import ArrayState
 from recon.board.observations import BoardObservations
+from recon.board.shape import BoardShape
 from recon.calibration.chain import Links
+from recon.calibration.exchanged import find_exchange
 from recon.calibration.faults import DeviceViews, explain_odd, odd_devices
 from recon.calibration.solver import CalibrateSettings, solve_array
-from tools.bench.board_scene import A4_BOARD, BoardScene, observe
+from tools.bench.board_scene import A4_BOARD, BoardScene, make_array, observe
 from tools.bench.board_video import (
     delay_device,
     make_video,
@@ -64,6 +66,26 @@ def test_a_device_out_of_step_is_named_with_its_frames(frames: int, told: str) -
 def test_devices_exchanged_midway_are_named_together() -> None:
     with pytest.raises(TakeError, match=r"cam02 and cam04: their pictures are exchanged from fr"):
         solve(swap_devices(video()[1], 2, 4, from_pose=45))
+
+
+def test_an_exchange_in_a_ring_is_laid_at_the_right_doors() -> None:
+    """Only neighbours share the board, so that no array solved without the two would tell."""
+    scene = BoardScene(
+        devices=8, layout="ring", span_deg=180.0, size_px=640, focal_px=1300.0, radius_mm=640.0,
+        poses=200, hidden=0.7, seed=5,
+    )  # fmt: skip
+    every = pick_poses(observe(scene, make_video(scene)), 100)
+    lenses = list(make_array(scene))
+    shape = BoardShape.flat_board(A4_BOARD.corners_mm())
+    assert find_exchange(lenses, every, shape) is None
+    poses = np.unique(every.pose[every.device == 5]).tolist()
+    middle = poses[len(poses) // 2]
+    found = find_exchange(lenses, swap_devices(every, 5, 6, from_pose=middle), shape)
+    assert found is not None
+    assert {found.one, found.other} == {5, 6}
+    assert abs(found.frame - every.frames[middle]) <= 4
+    late = delay_device(every, 3, 10)
+    assert find_exchange(lenses, late, shape) is None  # another fault
 
 
 def test_a_mirrored_device_is_named() -> None:

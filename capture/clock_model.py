@@ -90,3 +90,46 @@ def fit_model(t_dev_ns: Sequence[int], t_host_ns: Sequence[int]) -> ClockModel:
         rate,
         float(np.sqrt(np.mean(rest * rest))),
     )
+
+
+def model_of_arrivals(t_dev_ns: Sequence[int], t_host_ns: Sequence[int]) -> ClockModel:
+    """The line under which no frame arrived, through those that arrived soonest.
+
+    For a device whose clock cannot be read: frames are delayed, never early, so that the lower edge
+    of arrivals is the clock, later by the shortest delay there was.
+
+    Args:
+        t_dev_ns: times by the device's clock.
+        t_host_ns: when each frame arrived, by the host's.
+
+    Raises:
+        DeviceError: when there is no pair.
+
+    References:
+        Moon, Skelly, Towsley 1999, Estimation and removal of clock skew from network delay
+        measurements: the lower convex hull, its edge above the mean of the times.
+    """
+    if not t_dev_ns or len(t_dev_ns) != len(t_host_ns):
+        raise DeviceError(
+            f"a clock model needs pairs of times, found {len(t_dev_ns)} and {len(t_host_ns)}"
+        )
+    points = sorted({(d - t_dev_ns[0], h - d) for d, h in zip(t_dev_ns, t_host_ns, strict=True)})
+    hull: list[tuple[int, int]] = []
+    for point in points:
+        while len(hull) > 1 and _turns_down(hull[-2], hull[-1], point):
+            hull.pop()
+        if hull and hull[-1][0] == point[0]:
+            continue  # of two arrivals of one time, the sooner stands there already
+        hull.append(point)
+    middle = sum(x for x, _ in points) / len(points)
+    right = next((n for n, (x, _) in enumerate(hull) if x >= middle and n > 0), len(hull) - 1)
+    left = max(right - 1, 0)
+    (x0, y0), (x1, y1) = hull[left], hull[right]
+    slope = (y1 - y0) / (x1 - x0) if x1 > x0 else 0.0
+    dev = t_dev_ns[0] + x0
+    return ClockModel(dev, dev + y0, 1.0 / (1.0 + slope))
+
+
+def _turns_down(a: tuple[int, int], b: tuple[int, int], c: tuple[int, int]) -> bool:
+    """Whether b lies on or above the line from a to c."""
+    return (b[1] - a[1]) * (c[0] - a[0]) >= (c[1] - a[1]) * (b[0] - a[0])

@@ -25,7 +25,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from statistics import median
 
 from capture.clock_model import ClockModel, fit_model
@@ -36,6 +36,7 @@ from capture.ledger import Ledger, LedgerEntry, Oddity, Remark, Verdict
 
 _NEAR = 0.2  # of a period: further from a whole number of periods, a clock has jumped
 _REMEMBERED = 64
+_LAGS = 16  # frames, of which the soonest tells how late frames are when nothing delays them
 
 # What it takes to believe of a frame whose number and time disagree. A trigger is missed more often
 # than the host is late, and that more often than a clock or a number jumps; a device that lost its
@@ -46,47 +47,42 @@ _IMPOSSIBLE = _COST_EARLY
 
 @dataclass(frozen=True)
 class TriggerTrain:
-    """The triggers of a take.
+    """Triggers at equal steps of time, without end; indices run from 0.
 
     Attributes:
         start_ns: trigger 0, by the host's clock.
         period_ns: from trigger to trigger.
-        count: how many belong to the take; post-roll is from `count` on.
-        pre_roll: how many are sent before trigger 0.
     """
 
     start_ns: int
     period_ns: int
-    count: int
-    pre_roll: int = 0
 
     def __post_init__(self) -> None:
-        if self.period_ns < 1 or self.count < 1:
+        if self.period_ns < 1:
             raise SettingsError(
-                f"a trigger train needs a period and a count above 0, "
-                f"found {self.period_ns} ns, {self.count}"
+                f"a trigger train needs a period above 0, found {self.period_ns} ns"
             )
 
     def time_ns(self, trigger_index: int) -> int:
         """When a trigger is sent, by the host's clock."""
         return self.start_ns + trigger_index * self.period_ns
 
-    def owns(self, trigger_index: int) -> bool:
-        """Whether a trigger belongs to the take."""
-        return 0 <= trigger_index < self.count
-
 
 @dataclass(frozen=True)
-class Placement:
-    """Where a frame belongs.
+class DeviceClock:
+    """How the times of one device are read.
 
     Attributes:
-        trigger_index: its trigger; for a quarantined frame, the one it came after.
-        wanted: whether it belongs to the take: not quarantined, not pre-roll or post-roll.
+        model: its clock as read before any frame.
+        fitted: whether the same triggers as all others expose it, so that its clock can be fitted
+            to them; False when the model is to be believed: a synchronized clock, the host's own
+            clock, or a device that runs free.
+        phase_ns: how much later than the train's triggers it exposes; of devices that run free.
     """
 
-    trigger_index: int
-    wanted: bool
+    model: ClockModel
+    fitted: bool = True
+    phase_ns: int = 0
 
 
 @dataclass
@@ -94,13 +90,11 @@ class _Track:
     """What is known of one device so far."""
 
     info: DeviceInfo
-    model: ClockModel
+    clock: DeviceClock
     last: FrameEvent | None = None
     last_index: int = -1
-    aside: FrameEvent | None = (
-        None  # a quarantined frame never seen before: a reset, if others follow
-    )
     lags_ns: deque[int] = field(default_factory=lambda: deque(maxlen=_REMEMBERED))
+    first_lag_ns: int | None = None  # the shortest of the first lags
     seen: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=_REMEMBERED))
     placed: dict[int, FrameEvent] = field(default_factory=dict)
     reasons: dict[int, tuple[Verdict, str]] = field(default_factory=dict)
@@ -108,26 +102,48 @@ class _Track:
         default_factory=lambda: [[]]
     )  # trigger indices, cut at clock steps
 
+    def cut(self, window: range) -> _Track:
+        """What is known of some triggers."""
+        return replace(
+            self,
+            placed={k: self.placed[k] for k in window if k in self.placed},
+            reasons={k: self.reasons[k] for k in window if k in self.reasons},
+            segments=_cut(self.segments, window),
+        )
+
 
 class Collator:
-    """Places the frames of all devices and gives every (trigger, device) pair its verdict."""
+    """Places the frames of all devices and gives every (trigger, device) pair its verdict.
+
+    It goes on for as long as the array streams; takes are ledgers of a part of it. What is older
+    than `forget` says is dropped, so that memory does not grow.
+
+    Attributes:
+        train: the triggers.
+        slip_ns: how much later than the train says they come by now; see `follow`.
+    """
 
     def __init__(
-        self, devices: Sequence[DeviceInfo], train: TriggerTrain, models: Mapping[str, ClockModel]
+        self, devices: Sequence[DeviceInfo], train: TriggerTrain, clocks: Mapping[str, DeviceClock]
     ) -> None:
-        """Begin a take.
+        """Begin.
 
         Args:
-            devices: in the take's order.
+            devices: in the array's order.
             train: the triggers.
-            models: by device name, its clock as it was read before the take.
+            clocks: by device name, how its times are read.
         """
         self.train = train
-        self._tracks = {info.name: _Track(info, models[info.name]) for info in devices}
+        self.slip_ns = 0
+        self._tracks = {info.name: _Track(info, clocks[info.name]) for info in devices}
         self._remarks: list[Remark] = []
 
-    def add(self, event: FrameEvent) -> Placement:
-        """Place one frame; the frames of one device must come in the order they arrived."""
+    def add(self, event: FrameEvent) -> int | None:
+        """Place one frame; the frames of one device must come in the order they arrived.
+
+        Returns:
+            The trigger that exposed it; None when it is quarantined.
+        """
         track = self._tracks[event.device]
         index = (
             self._first(track, event)
@@ -135,67 +151,142 @@ class Collator:
             else self._next(track, track.last, event)
         )
         if index is None:
-            return Placement(track.last_index, wanted=False)
+            return None
         track.last, track.last_index = event, index
         track.lags_ns.append(event.t_host_ns - self.train.time_ns(index))
+        if track.first_lag_ns is None and len(track.lags_ns) == _LAGS:
+            track.first_lag_ns = min(track.lags_ns)
         track.seen.append((event.frame_id, event.t_dev_ns))
         track.segments[-1].append(index)
         track.placed[index] = event
-        return Placement(index, wanted=self.train.owns(index))
+        return index
+
+    def restart(self, device: str, clock: DeviceClock) -> None:
+        """Take a device up anew that was lost and found again: its next frame is a first one."""
+        track = self._tracks[device]
+        track.clock, track.last = clock, None
+        track.lags_ns.clear()
+        track.seen.clear()
+        track.segments.append([])
+
+    def trust(self, device: str, clock: DeviceClock) -> None:
+        """Read a device's times anew from now on; its frames stay where they are."""
+        self._tracks[device].clock = clock
+
+    def follow(self) -> None:
+        """Follow a generator whose period is not quite the train's.
+
+        Frames then come later and later by the host's clock, or earlier, in all devices alike. Over
+        an hour a hundred millionths make a third of a second.
+        """
+        slips = [
+            min(track.lags_ns) - track.first_lag_ns
+            for track in self._tracks.values()
+            if track.first_lag_ns is not None and track.lags_ns
+        ]
+        if slips:
+            self.slip_ns = round(median(slips))
+
+    def train_from(self, trigger_index: int) -> TriggerTrain:
+        """The train as it runs by now, counted from one of its triggers."""
+        return TriggerTrain(self.train.time_ns(trigger_index) + self.slip_ns, self.train.period_ns)
+
+    def index_at(self, t_ns: int) -> int:
+        """The latest trigger at or before a time of the host's clock; negative before the first."""
+        return (t_ns - self.train.start_ns - self.slip_ns) // self.train.period_ns
+
+    def last_index(self, device: str) -> int:
+        """The trigger of a device's latest frame; -1 before any."""
+        return self._tracks[device].last_index
 
     def settled(self, trigger_index: int) -> bool:
         """Whether every device has a frame at or after this trigger."""
         return all(track.last_index >= trigger_index for track in self._tracks.values())
 
-    def close(self) -> Ledger:
-        """The ledger; pairs of which nothing was heard get the verdict MISSING."""
+    def ledger(self, first: int, count: int) -> Ledger:
+        """The verdicts of `count` triggers from `first` on, counted from 0.
+
+        Pairs of which nothing was heard get the verdict MISSING.
+        """
         names = tuple(self._tracks)
-        common = {name: self._common_times(track) for name, track in self._tracks.items()}
+        window = range(first, first + count)
+        common = {name: self._common_times(track, window) for name, track in self._tracks.items()}
         entries = tuple(
-            self._entry(self._tracks[name], k, common[name])
-            for k in range(self.train.count)
+            self._entry(self._tracks[name], k, first, common[name])
+            for k in window
             for name in names
         )
-        return Ledger(names, self.train.count, entries, tuple(self._remarks))
+        remarks = tuple(
+            replace(remark, trigger_index=remark.trigger_index - first)
+            for remark in self._remarks
+            if remark.trigger_index in window
+        )
+        return Ledger(names, count, entries, remarks)
 
-    def clocks(self) -> dict[str, ClockModel]:
-        """Each device's clock as fitted to the trigger train; before any frame, as it was read."""
+    def cut(self, first: int, count: int) -> Collator:
+        """A copy that knows these triggers alone: what is asked of it holds up no frame."""
+        window = range(first, first + count)
+        part = Collator([], self.train, {})
+        part.slip_ns = self.slip_ns
+        part._tracks = {name: track.cut(window) for name, track in self._tracks.items()}
+        part._remarks = [remark for remark in self._remarks if remark.trigger_index in window]
+        return part
+
+    def clocks(self, first: int, count: int) -> dict[str, ClockModel]:
+        """Each device's clock over these triggers; without frames, as it was read."""
+        window = range(first, first + count)
         return {
-            name: self._fit(track, max(track.segments, key=len))
+            name: self._fit(track, max(_cut(track.segments, window), key=len, default=[]))
             for name, track in self._tracks.items()
         }
 
+    def forget(self, before: int) -> None:
+        """Drop what is known of triggers before this one."""
+        for track in self._tracks.values():
+            track.placed = {k: event for k, event in track.placed.items() if k >= before}
+            track.reasons = {k: reason for k, reason in track.reasons.items() if k >= before}
+            kept = [[k for k in part if k >= before] for part in track.segments]
+            track.segments = [part for part in kept[:-1] if part] + kept[-1:]
+        self._remarks = [remark for remark in self._remarks if remark.trigger_index >= before]
+
     def _first(self, track: _Track, event: FrameEvent) -> int:
-        phase = (track.model.to_host(event.t_dev_ns) - self.train.start_ns) / self.train.period_ns
-        newest = (event.t_host_ns - self.train.start_ns) // self.train.period_ns
+        period = self.train.period_ns
+        start = self.train.start_ns + track.clock.phase_ns
+        phase = (track.clock.model.to_host(event.t_dev_ns) - start) / period
+        newest = (event.t_host_ns - start) // period
+        lowest = track.last_index + 1
         index = round(phase)
-        if abs(phase - index) <= _NEAR and -self.train.pre_roll <= index <= newest:
+        if abs(phase - index) <= _NEAR and lowest <= index <= newest:
             return index
-        self._remark(track, Oddity.CLOCK_STEP, event)
-        return max(newest, -self.train.pre_roll)
+        index = max(newest, lowest)
+        self._remark(track, Oddity.CLOCK_STEP, event, index)
+        return index
 
     def _next(self, track: _Track, last: FrameEvent, event: FrameEvent) -> int | None:
-        ids = _id_step(last.frame_id, event.frame_id, track.info.id_bits)
+        ids = _id_step(last.frame_id, event.frame_id, track.info)
         step = (event.t_dev_ns - last.t_dev_ns) / self.train.period_ns
         near = abs(step - round(step)) <= _NEAR
         again = (event.frame_id, event.t_dev_ns) in track.seen or (near and round(step) == ids < 0)
         if ids == 0 or again:
-            self._remark(track, Oddity.DUPLICATE if ids == 0 else Oddity.STALE, event)
+            oddity = Oddity.DUPLICATE if ids == 0 else Oddity.STALE
+            self._remark(track, oddity, event, track.last_index)
             if near and step > 0.5:
                 track.reasons[track.last_index + round(step)] = (Verdict.QUARANTINED, "")
             return None
         by_time = track.last_index + round(step) if near and step > 0.5 else None
         by_id = track.last_index + ids if ids >= 1 else None
-        agreed = by_time is not None and by_time == by_id
-        index = by_time if agreed else self._weigh(track, event, by_time, by_id)
+        # Within half a period, a time that is off says nothing against the number: drivers that
+        # date frames themselves do so late when the host is busy.
+        agreed = by_id is not None and step > 0.5 and abs(step - ids) < 0.5
+        index = by_id if agreed else self._weigh(track, event, by_time, by_id)
         if index is None:
-            self._remark(track, Oddity.STALE, event)
+            self._remark(track, Oddity.STALE, event, track.last_index)
             return None
         if index != by_time:
-            self._remark(track, Oddity.CLOCK_STEP, event)
+            self._remark(track, Oddity.CLOCK_STEP, event, index)
             track.segments.append([])
         if by_id is None or by_id > index:
-            self._remark(track, Oddity.ID_RESET, event)
+            self._remark(track, Oddity.ID_RESET, event, index)
         self._explain_gap(track, index, by_id)
         return index
 
@@ -204,14 +295,16 @@ class Collator:
     ) -> int | None:
         """The likeliest index of a frame whose number and time disagree; None when none is."""
         period = self.train.period_ns
-        usual = median(track.lags_ns)
+        usual, soonest = median(track.lags_ns), min(track.lags_ns)
         by_arrival = round((event.t_host_ns - self.train.start_ns - usual) / period)
         best, least = None, _IMPOSSIBLE
         for index in (by_time, by_id, by_arrival):
             if index is None or index <= track.last_index:
                 continue
-            late = (event.t_host_ns - self.train.time_ns(index) - usual) / period
-            cost = _COST_EARLY if late < -0.5 else _COST_LATE if late > 0.5 else 0.0
+            lag = event.t_host_ns - self.train.time_ns(index)
+            # A busy host is late by turns: early is what comes sooner than any frame before.
+            early, late = (soonest - lag) / period > 0.5, (lag - usual) / period > 0.5
+            cost = _COST_EARLY if early else _COST_LATE if late else 0.0
             cost += 0.0 if index == by_time else _COST_CLOCK
             if by_id is None or by_id > index:
                 cost += _COST_NUMBER
@@ -229,39 +322,45 @@ class Collator:
             verdict = Verdict.LOST if place < lost else Verdict.MISSED_TRIGGER
             track.reasons.setdefault(k, (verdict, note))
 
-    def _remark(self, track: _Track, oddity: Oddity, event: FrameEvent) -> None:
-        index = max(track.last_index, -1)
+    def _remark(self, track: _Track, oddity: Oddity, event: FrameEvent, index: int) -> None:
         self._remarks.append(Remark(track.info.name, oddity, index, event.frame_id))
 
     def _fit(self, track: _Track, segment: Sequence[int]) -> ClockModel:
-        if not segment:
-            return track.model
+        if not segment or not track.clock.fitted:
+            return track.clock.model
+        start = self.train_from(0)
         return fit_model(
-            [track.placed[k].t_dev_ns for k in segment], [self.train.time_ns(k) for k in segment]
+            [track.placed[k].t_dev_ns for k in segment], [start.time_ns(k) for k in segment]
         )
 
-    def _common_times(self, track: _Track) -> dict[int, int]:
+    def _common_times(self, track: _Track, window: range) -> dict[int, int]:
         times: dict[int, int] = {}
-        for segment in track.segments:
-            if segment:
-                model = self._fit(track, segment)
-                times.update({k: model.to_host(track.placed[k].t_dev_ns) for k in segment})
+        for segment in _cut(track.segments, window):
+            model = self._fit(track, segment)
+            times.update({k: model.to_host(track.placed[k].t_dev_ns) for k in segment})
         return times
 
-    def _entry(self, track: _Track, k: int, common: Mapping[int, int]) -> LedgerEntry:
+    def _entry(self, track: _Track, k: int, first: int, common: Mapping[int, int]) -> LedgerEntry:
         name = track.info.name
         if k not in track.placed:
             verdict, note = track.reasons.get(k, (Verdict.MISSING, ""))
-            return LedgerEntry(k, name, verdict, note=note)
+            return LedgerEntry(k - first, name, verdict, note=note)
         event = track.placed[k]
         verdict = Verdict.OK if event.complete else Verdict.INCOMPLETE
         return LedgerEntry(
-            k, name, verdict, event.frame_id, event.t_dev_ns, event.t_host_ns, common[k]
-        )
+            k - first, name, verdict, event.frame_id, event.t_dev_ns, event.t_host_ns, common[k],
+            event.note,
+        )  # fmt: skip
 
 
-def _id_step(last: int, now: int, bits: int) -> int:
-    """The step, the shorter way round, of a number that counts 1 .. 2^bits - 1 and wraps to 1."""
-    modulus = (1 << bits) - 1
+def _cut(segments: Sequence[Sequence[int]], window: range) -> list[list[int]]:
+    """The parts of the segments that lie in a window; empty ones are left out."""
+    parts = ([k for k in part if k in window] for part in segments)
+    return [part for part in parts if part]
+
+
+def _id_step(last: int, now: int, info: DeviceInfo) -> int:
+    """The step, the shorter way round, of a number that counts up and wraps to its first."""
+    modulus = (1 << info.id_bits) - info.first_id
     step = (now - last) % modulus
     return step - modulus if step > modulus // 2 else step

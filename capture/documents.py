@@ -1,15 +1,18 @@
-"""JSON and TOML files, read so that whatever is wrong with one is told in one line."""
+"""JSON and TOML files: read so that whatever is wrong is told in one line, and JSON kept safe."""
 
 from __future__ import annotations
 
 import json
+import os
 import tomllib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from capture.errors import InputError
+from capture.durable import sync_folder
+from capture.errors import InputError, WorkError
 from capture.names import known_hint
+from capture.product import replacing
 
 _FAULTS = (OSError, ValueError, RecursionError)
 """Unreadable; not text, not that language, a number of too many digits; nested without end."""
@@ -50,6 +53,22 @@ def key_problems(
         if key not in known:
             problems.append(f"{what}: unknown key {key!r}; {known_hint(key, known)}")
     return problems
+
+
+def write_json(path: Path, document: Mapping[str, Any]) -> None:
+    """Write a JSON file, whole or not at all, and wait until the disk holds it.
+
+    Raises:
+        WorkError: naming the file, when the disk does not take it; the old file stays.
+    """
+    try:
+        with replacing(path) as partial, partial.open("w", encoding="utf-8") as file:
+            file.write(json.dumps(document, indent=1) + "\n")
+            file.flush()
+            os.fsync(file.fileno())
+        sync_folder(Path(path).parent)
+    except OSError as error:
+        raise WorkError(f"{path}: not written: {error.strerror or error}") from error
 
 
 def _read(

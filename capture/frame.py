@@ -55,6 +55,7 @@ class FrameEvent:
         slot: by which the device finds the pixels.
         exposure_us: exposure time; -1 unknown.
         complete: False when parts of the image did not arrive.
+        note: what else the ledger should say of it: that packets were resent, for one.
     """
 
     device: str
@@ -64,6 +65,7 @@ class FrameEvent:
     slot: int
     exposure_us: float = -1.0
     complete: bool = True
+    note: str = ""
 
 
 @dataclass(frozen=True, eq=False)

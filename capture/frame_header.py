@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from capture.arrays import Image
+from capture.crc import crc32
 from capture.errors import TakeError
 
 HEADER_BYTES = 64
@@ -86,6 +87,17 @@ class ImageLayout:
     def __str__(self) -> str:
         kind = "mono" if self.channels == 1 else "RGB"
         return f"{self.width} x {self.height} {kind} {self.dtype}"
+
+
+def raw_pixels(image: Image) -> memoryview:
+    """The bytes of an image as they stand on disk; a view of it, if it lies so in memory."""
+    little = np.ascontiguousarray(image, dtype=image.dtype.newbyteorder("<"))
+    return little.data.cast("B")
+
+
+def pixel_crc(image: Image) -> int:
+    """The CRC-32 of an image's bytes as they stand on disk, as a header holds it."""
+    return crc32(raw_pixels(image))
 
 
 @dataclass(frozen=True)

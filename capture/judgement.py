@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from enum import StrEnum
 from itertools import pairwise
@@ -29,6 +30,9 @@ class Colour(StrEnum):
     RED = "red"
 
 
+_ORDER = (Colour.GREEN, Colour.AMBER, Colour.RED)
+
+
 @dataclass(frozen=True)
 class Judgement:
     """The verdict on a take, for the operator.
@@ -42,6 +46,12 @@ class Judgement:
     colour: Colour
     sentence: str
     spread_ns: int
+
+    def at_best(self, colour: Colour, sentence: str) -> Judgement:
+        """No better than a colour; the sentence is added where that makes it worse."""
+        if _ORDER.index(colour) <= _ORDER.index(self.colour):
+            return self
+        return Judgement(colour, f"{self.sentence} {sentence}", self.spread_ns)
 
 
 def judge(ledger: Ledger, hold: tuple[int, int] | None = None) -> Judgement:
@@ -80,7 +90,7 @@ def judge(ledger: Ledger, hold: tuple[int, int] | None = None) -> Judgement:
     if jumps:
         colour = Colour.RED if colour == Colour.RED else Colour.AMBER
         reasons.append(f"the clock or the frame numbers of {', '.join(jumps)} jumped")
-    return Judgement(colour, _sentence(colour, reasons, ledger), spread)
+    return Judgement(colour, _sentence(colour, reasons, ledger) + _noted(ledger), spread)
 
 
 def _sentence(colour: Colour, reasons: list[str], ledger: Ledger) -> str:
@@ -89,6 +99,12 @@ def _sentence(colour: Colour, reasons: list[str], ledger: Ledger) -> str:
     text = "; ".join(reasons)
     advice = "Take it again." if colour == Colour.RED else "The take can be used."
     return f"{text[0].upper()}{text[1:]}. {advice}"
+
+
+def _noted(ledger: Ledger) -> str:
+    """What the devices noted of frames that are whole: that packets were sent again, for one."""
+    notes = Counter(e.note for e in ledger.entries if e.verdict == Verdict.OK and e.note)
+    return "".join(f" {count} frames: {note}." for note, count in sorted(notes.items()))
 
 
 def _causes(broken: dict[int, list[LedgerEntry]]) -> str:

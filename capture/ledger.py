@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
 
@@ -141,6 +141,22 @@ def all_present(devices: Sequence[str], triggers: int) -> Ledger:
         for device in devices
     )
     return Ledger(tuple(devices), triggers, entries)
+
+
+def unwritten(ledger: Ledger, reasons: Mapping[tuple[int, str], str]) -> Ledger:
+    """The ledger when some frames came and could not be written: they are lost, and why is noted.
+
+    Args:
+        ledger: as collated.
+        reasons: by trigger index and device.
+    """
+    entries = tuple(
+        replace(entry, verdict=Verdict.LOST, note=f"not written: {reasons[pair]}")
+        if (pair := (entry.trigger_index, entry.device)) in reasons
+        else entry
+        for entry in ledger.entries
+    )
+    return replace(ledger, entries=entries)
 
 
 def write_ledger(path: Path, ledger: Ledger) -> None:

@@ -11,9 +11,8 @@ References:
 from __future__ import annotations
 
 import os
-import zlib
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
@@ -23,49 +22,137 @@ import numpy as np
 
 from capture import mcap_records as records
 from capture.arrays import Image
-from capture.crc import Crc32Joiner
+from capture.crc import Crc32Joiner, crc32
+from capture.durable import AppendFile
 from capture.errors import TakeError, WorkError
-from capture.frame_header import HEADER_BYTES, FrameHeader, ImageLayout
+from capture.frame_header import HEADER_BYTES, FrameHeader, ImageLayout, raw_pixels
 from capture.mcap_records import CHUNK_HEAD, FOOTER, MAGIC, MESSAGE_PREFIX_BYTES, RECORD, Op
 
 _CHUNK_FRONT_BYTES = RECORD.size + CHUNK_HEAD.size
 _FRONT_BYTES = _CHUNK_FRONT_BYTES + MESSAGE_PREFIX_BYTES  # of a chunk, before its pixels
 
 
+def partial_file(path: Path) -> Path:
+    """What the file of frames is called until it is closed."""
+    return path.with_name(path.name + ".partial")
+
+
+def file_head(device: str, layout: ImageLayout) -> tuple[bytes, bytes, bytes]:
+    """What stands before the first frame of a device's file, and in it the schema and channel."""
+    metadata = {
+        "device": device,
+        "width": str(layout.width),
+        "height": str(layout.height),
+        "channels": str(layout.channels),
+        "dtype": layout.dtype,
+        "order": "RGB" if layout.channels == 3 else "mono",
+        "byteorder": "little",
+    }
+    schema, channel = records.schema_record(), records.channel_record(device, metadata)
+    return MAGIC + records.header_record() + schema + channel, schema, channel
+
+
+def file_end(
+    offset: int, schema: bytes, channel: bytes, chunks: Sequence[tuple[int, int, int]]
+) -> bytes:
+    """What stands behind the last frame, at `offset`: the end of the data, and the summary.
+
+    Args:
+        offset: where it begins.
+        schema: the schema's record.
+        channel: the channel's record.
+        chunks: time, offset and length of each chunk.
+    """
+    start = offset + len(records.DATA_END)
+    return records.DATA_END + records.summary(start, schema, channel, chunks)
+
+
+def log_time_ns(header: FrameHeader) -> int:
+    """The log time of a frame: its arrival, or its trigger index where that is not known."""
+    return header.t_host_ns if header.t_host_ns >= 0 else max(header.trigger_index, 0)
+
+
+def frame_bytes(layout: ImageLayout) -> int:
+    """How long the chunk of one frame is."""
+    return _FRONT_BYTES + layout.nbytes
+
+
+def check_frame(chunk: memoryview, joiner: Crc32Joiner) -> str:
+    """What is wrong with a frame in a chunk; empty when it is as it was written.
+
+    The front of the chunk, which its CRC does not cover, is not looked at: `has_sound_front` does.
+
+    Args:
+        chunk: as read from the file, `frame_bytes` long unless the file was cut.
+        joiner: of the pixels' size.
+    """
+    if len(chunk) < _FRONT_BYTES:
+        return f"cut after {len(chunk)} bytes"
+    expected = CHUNK_HEAD.unpack_from(chunk, RECORD.size)[3]
+    pixels = crc32(chunk[_FRONT_BYTES:])
+    found = joiner.join(crc32(chunk[_CHUNK_FRONT_BYTES:_FRONT_BYTES]), pixels)
+    if found != expected:
+        return f"damaged: expected CRC {expected:08x}, found {found:08x}"
+    try:
+        header = header_in(chunk)
+    except TakeError as error:
+        return str(error)
+    if header.pixel_crc != pixels:
+        return "its pixels do not match the CRC in its header"
+    return ""
+
+
+def header_in(chunk: memoryview) -> FrameHeader:
+    """The header of the frame in a chunk.
+
+    Raises:
+        TakeError: when there is none.
+    """
+    return FrameHeader.unpack(bytes(chunk[_FRONT_BYTES - HEADER_BYTES : _FRONT_BYTES]))
+
+
+def has_sound_front(chunk: memoryview) -> bool:
+    """Whether the front of a chunk, which no CRC covers, is as its frame says it was written."""
+    size, crc = len(chunk) - _CHUNK_FRONT_BYTES, CHUNK_HEAD.unpack_from(chunk, RECORD.size)[3]
+    expected = records.chunk_head(log_time_ns(header_in(chunk)), size, crc)
+    return bytes(chunk[:_CHUNK_FRONT_BYTES]) == expected
+
+
 class FrameWriter:
     """Writes the frames of one device to an MCAP file: to `NAME.partial`, renamed at close.
 
-    Used in a `with` block: a clean end closes the file, an exception removes what was written.
+    Used in a `with` block: a clean end closes the file; an exception abandons it, which keeps what
+    was written for `likeness recover`. One thread writes; `sync` may be called from another one.
     """
 
-    def __init__(self, path: Path, device: str, layout: ImageLayout) -> None:
+    def __init__(
+        self, path: Path, device: str, layout: ImageLayout, *, reserve_frames: int = 0
+    ) -> None:
         """Open the file and write its head.
 
         Args:
             path: the file to make.
             device: the device's name, which becomes the channel's topic.
             layout: size and pixel type of every frame.
+            reserve_frames: how many to take room on the disk for at once, if it has it.
+
+        Raises:
+            WorkError: when the disk is full or fails.
         """
         self.path = Path(path)
         self.layout = layout
-        self._partial = self.path.with_name(self.path.name + ".partial")
-        self._file: BinaryIO = self._partial.open("wb", buffering=0)
-        self._offset = 0
         self._joiner = Crc32Joiner(layout.nbytes)
         self._index: list[tuple[int, int, int]] = []  # log time, offset and length of each chunk
-        metadata = {
-            "device": device,
-            "width": str(layout.width),
-            "height": str(layout.height),
-            "channels": str(layout.channels),
-            "dtype": layout.dtype,
-            "order": "RGB" if layout.channels == 3 else "mono",
-            "byteorder": "little",
-        }
-        self._schema = records.schema_record()
-        self._channel = records.channel_record(device, metadata)
-        with self._discarded_on_failure():
-            self._write(MAGIC + records.header_record() + self._schema + self._channel)
+        head, self._schema, self._channel = file_head(device, layout)
+        self._file = AppendFile(partial_file(self.path), str(self.path))
+        try:
+            if reserve_frames:
+                stride = frame_bytes(layout) + len(records.message_index(0))
+                self._file.reserve(len(head) + reserve_frames * stride)
+            self._file.append(head)
+        except BaseException:
+            self.discard()
+            raise
 
     def __enter__(self) -> FrameWriter:
         return self
@@ -79,67 +166,68 @@ class FrameWriter:
         if kind is None:
             self.close()
         else:
-            self._discard()
+            self.abandon()
 
-    def write(self, header: FrameHeader, pixels: Image) -> None:
+    def __len__(self) -> int:
+        return len(self._index)
+
+    def write(self, header: FrameHeader, pixels: Image, pixel_crc: int | None = None) -> None:
         """Append one frame.
 
         Args:
-            header: what is known of it; its CRC is computed here.
+            header: what is known of it; its CRC is filled in here.
             pixels: (H, W) or (H, W, 3) of the file's layout.
+            pixel_crc: `capture.frame_header.pixel_crc` of the pixels, when another thread has it.
 
         Raises:
             TakeError: when the pixels are of another layout.
-            WorkError: when the disk is full or fails.
+            WorkError: when the disk is full or fails; all frames before this one are whole, and
+                the file can be closed.
         """
         if ImageLayout.of(pixels) != self.layout:
             raise TakeError(f"{self.path}: expected {self.layout}, found {ImageLayout.of(pixels)}")
-        little = np.ascontiguousarray(pixels, dtype=np.dtype(self.layout.dtype).newbyteorder("<"))
-        raw = little.data.cast("B")
-        header = replace(header, pixel_crc=zlib.crc32(raw))
-        time = header.t_host_ns if header.t_host_ns >= 0 else max(header.trigger_index, 0)
+        raw = raw_pixels(pixels)
+        header = replace(header, pixel_crc=crc32(raw) if pixel_crc is None else pixel_crc)
+        time = log_time_ns(header)
         message = records.message_head(len(self._index), time, HEADER_BYTES + len(raw))
         prefix = message + header.pack()
-        crc = self._joiner.join(zlib.crc32(prefix), header.pixel_crc)
+        crc = self._joiner.join(crc32(prefix), header.pixel_crc)
         head = records.chunk_head(time, len(prefix) + len(raw), crc)
-        self._index.append((time, self._offset, len(head) + len(prefix) + len(raw)))
-        self._write(head + prefix, raw, records.message_index(time))
+        at = self._file.offset
+        self._file.append(head + prefix, raw, records.message_index(time))
+        self._index.append((time, at, len(head) + len(prefix) + len(raw)))
+
+    def sync(self) -> None:
+        """Bring what was written to the disk; from any thread."""
+        self._file.sync()
 
     def close(self) -> None:
-        """Write the summary, bring it all to the disk, and give the file its name."""
+        """Write the summary, bring it all to the disk, and give the file its name.
+
+        Raises:
+            WorkError: when the disk is full or fails; the file stays as `NAME.partial`, its frames
+                whole.
+        """
         if self._file.closed:
             return
-        with self._discarded_on_failure():
-            self._write(records.record(Op.DATA_END, bytes(4)))  # 0: no CRC of the data section
-            self._write(records.summary(self._offset, self._schema, self._channel, self._index))
-            os.fsync(self._file.fileno())
-            self._file.close()
-            self._partial.replace(self.path)
-
-    @contextmanager
-    def _discarded_on_failure(self) -> Iterator[None]:
         try:
-            yield
-        except BaseException:
-            self._discard()
+            at = self._file.offset
+            self._file.append(file_end(at, self._schema, self._channel, self._index))
+        except WorkError:
+            self.abandon()
             raise
-
-    def _discard(self) -> None:
         self._file.close()
-        self._partial.unlink(missing_ok=True)
+        partial_file(self.path).replace(self.path)
 
-    def _write(self, *parts: bytes | memoryview) -> None:
-        pending = [memoryview(part).cast("B") for part in parts]
-        while pending:
-            try:
-                written = os.writev(self._file.fileno(), pending)
-            except OSError as error:
-                raise WorkError(f"{self.path}: cannot be written: {error.strerror}") from error
-            self._offset += written
-            while pending and written >= len(pending[0]):
-                written -= len(pending.pop(0))
-            if pending and written:
-                pending[0] = pending[0][written:]
+    def abandon(self) -> None:
+        """Close the file as it is: it stays as `NAME.partial`, without a summary."""
+        with suppress(WorkError):  # whoever abandons knows already that something is wrong
+            self._file.close()
+
+    def discard(self) -> None:
+        """Remove what was written."""
+        self.abandon()
+        partial_file(self.path).unlink(missing_ok=True)
 
 
 class FrameReader:
@@ -177,6 +265,11 @@ class FrameReader:
     def __len__(self) -> int:
         return len(self._offsets)
 
+    @property
+    def offsets(self) -> tuple[int, ...]:
+        """Where in the file the chunk of each frame begins, as `headers`."""
+        return tuple(self._offsets)
+
     def read(self, index: int) -> Image:
         """The pixels of one frame, (H, W) or (H, W, 3).
 
@@ -196,7 +289,7 @@ class FrameReader:
         if count != _FRONT_BYTES + len(raw):
             raise TakeError(f"{label}: expected {_FRONT_BYTES + len(raw)} bytes, found {count}")
         expected = CHUNK_HEAD.unpack_from(head, RECORD.size)[3]
-        found = zlib.crc32(raw, zlib.crc32(head[_CHUNK_FRONT_BYTES:]))
+        found = crc32(raw, crc32(head[_CHUNK_FRONT_BYTES:]))
         if found != expected:
             raise TakeError(f"{label}: damaged: expected CRC {expected:08x}, found {found:08x}")
         return pixels.astype(self.layout.dtype, copy=False)
@@ -236,7 +329,7 @@ class FrameReader:
         if not 0 < start <= self._size - tail:
             return None
         summary = _read_at(file, start, self._size - tail - start)
-        if zlib.crc32(summary + footer[: RECORD.size + 16]) != crc:
+        if crc32(summary + footer[: RECORD.size + 16]) != crc:
             return None
         chunks = records.parse_chunks(summary)
         expected = RECORD.size + self._chunk_bytes()

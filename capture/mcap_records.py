@@ -45,6 +45,9 @@ def record(opcode: Op, content: bytes) -> bytes:
     return RECORD.pack(opcode, len(content)) + content
 
 
+DATA_END = record(Op.DATA_END, bytes(4))  # 0: no CRC of the data section
+
+
 def header_record() -> bytes:
     """The first record of a file."""
     return record(Op.HEADER, _text("") + _text("likeness"))

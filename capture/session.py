@@ -14,25 +14,33 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
+import shutil
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from capture.devices.protocol import DeviceArray
+from capture.collate import TriggerTrain
+from capture.devices.array import DeviceArray
+from capture.devices.capabilities import Health
 from capture.documents import read_json
 from capture.errors import SettingsError, TakeError, raise_all
-from capture.judgement import Judgement, judge
-from capture.ledger import write_ledger
+from capture.judgement import Colour, Judgement, judge
 from capture.manifest import DeviceEntry, TakeManifest
 from capture.names import is_plain_name
 from capture.product import replacing
 from capture.progress import Progress, silent
-from capture.recorder import Recording, RecordSettings, record_frames
+from capture.recorder import Recording, RecordSettings
+from capture.stream import record_frames
+from capture.sync_report import SyncReport, sync_report
 from capture.take import Take
-from capture.take_writer import TakeWriter
+from capture.take_notes import NoteBook, TakeStatus
+from capture.take_writer import TakeWriter, partial_folder
+from capture.verify import settle, verify_take
 
 FORMAT = "likeness-session"
 VERSION = 1
+_RANKS = {TakeStatus.KEEP: 2, TakeStatus.RETAKE: 0}  # all else 1
 _KINDS = ("board", "neutral", "expression")
 
 
@@ -45,7 +53,8 @@ class Shot:
         kind: "board", "neutral" or "expression".
         frames: how many.
         start_ns: when trigger 0 is sent, by the line's clock; None: as soon as all is ready.
-        hold: first and last frame of the part that must be whole, or None.
+        hold: first and last frame of the part that must be whole, counted without the pre-roll; or
+            None.
     """
 
     slate: str
@@ -164,8 +173,8 @@ class Session:
         """
         found: list[tuple[str, int, Path, dict[str, Any]]] = []
         for folder in sorted((self.folder / "takes").glob("*/take.json")):
-            if folder.parent.name.startswith("."):  # what a killed recording left behind
-                continue
+            if folder.parent.name.startswith(".") or folder.parent.suffix == ".partial":
+                continue  # not finished, or left behind by a recording that was killed
             remarks = dict(Take.open(folder.parent).manifest.remarks)
             if "shot" in remarks and "take_number" in remarks:
                 _check_remarks(folder, remarks)
@@ -187,15 +196,20 @@ class Session:
         )
 
     def take(self, slate: str) -> Take:
-        """The latest take of a slate.
+        """The take of a slate that counts: the latest that the operator kept; else the latest that
+        was not to be taken again; else the latest.
 
         Raises:
             TakeError: naming the slates that were recorded.
         """
-        notes = self.takes()
-        for note in notes:
-            if note.slate == slate and not note.superseded:
-                return Take.open(note.folder)
+        notes, book = self.takes(), NoteBook.of_session(self.folder)
+        ranked = [
+            (_RANKS.get(book.read(note.folder.name).status, 1), note.take_number, note.folder)
+            for note in notes
+            if note.slate == slate
+        ]
+        if ranked:
+            return Take.open(max(ranked)[2])
         known = ", ".join(sorted({note.slate for note in notes})) or "none"
         raise TakeError(f"{self.folder}: no take of {slate!r}; recorded slates: {known}")
 
@@ -203,7 +217,7 @@ class Session:
         """The take number that the next take of a slate will have."""
         numbers = [0]
         for folder in (self.folder / "takes").glob(f"{slate}_*"):
-            matched = re.fullmatch(re.escape(slate) + r"_(\d+)", folder.name)
+            matched = re.fullmatch(re.escape(slate) + r"_(\d+)(\.partial)?", folder.name)
             if matched:
                 numbers.append(int(matched[1]))
         return max(numbers) + 1
@@ -249,51 +263,127 @@ def record_take(
     number = session.next_number(shot.slate)
     folder = session.folder / "takes" / f"{shot.slate}_{number:03d}"
     layouts = {device.info.name: device.info.layout for device in array.devices}
-    total = shot.frames * len(layouts)
+    count = settings.pre_roll + shot.frames + settings.post_roll
+    total = count * len(layouts)
     label = f"record {folder.name}"
-    with replacing(folder) as partial:
+    partial = partial_folder(folder)
+    try:
         with TakeWriter(partial, layouts) as writer:
             recording = record_frames(
                 array,
                 settings,
                 writer.write,
-                count=shot.frames,
+                count=count,
                 start_ns=shot.start_ns,
                 told=lambda frames: progress(frames, total, label),
             )
-            verdict = judge(recording.ledger, shot.hold)
-
-            def describe(devices: tuple[DeviceEntry, ...]) -> TakeManifest:
-                return TakeManifest(
-                    name=folder.name,
-                    kind="capture",
-                    devices=devices,
-                    frame_count=shot.frames,
-                    period_ns=recording.train.period_ns,
-                    start_ns=recording.train.start_ns,
-                    remarks=_remarks(shot, number, settings, recording, verdict),
-                )
-
-            writer.finish(describe)
-        write_ledger(partial / "ledger.csv", recording.ledger)
-    return Take.open(folder)
+            verdict = judge_take(recording, shot, settings)
+            opening = opening_of(shot, number, settings, recording.train)
+            writer.finish(
+                lambda devices: manifest_of(opening, folder.name, devices, recording, verdict),
+                ledger=recording.ledger,
+                hashed=False,
+            )
+        take = Take.open(partial)
+        return settle(take, verify_take(take))
+    except BaseException:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise
 
 
-def _remarks(
-    shot: Shot, number: int, settings: RecordSettings, recording: Recording, verdict: Judgement
+def judge_take(
+    recording: Recording, shot: Shot, settings: RecordSettings, told: Sequence[str] = ()
+) -> Judgement:
+    """The verdict on a take of a shot: of its ledger, made worse by what its times and clocks say.
+
+    A take that was ended early is judged by what there is.
+
+    Args:
+        recording: of the whole take, pre-roll and post-roll included.
+        shot: what was to be recorded.
+        settings: how.
+        told: what became of synchronized clocks meanwhile; each makes it amber.
+    """
+    hold = shot.hold
+    if hold is not None:
+        first, last = (settings.pre_roll + frame for frame in hold)
+        last = min(last, recording.ledger.triggers - 1)
+        hold = (first, last) if first <= last else None
+    verdict = judge(recording.ledger, hold)
+    sync = sync_of(recording)
+    verdict = verdict.at_best(sync.colour, sync.sentence)
+    return verdict.at_best(Colour.AMBER, " ".join(told)) if told else verdict
+
+
+def sync_of(recording: Recording) -> SyncReport:
+    """How well the devices of a recording exposed together."""
+    # Devices that run free are dated by readings of their clocks, not by the triggers: those times
+    # are true as far as the readings are.
+    basis = "host" if recording.basis == "free" else recording.basis
+    period_ns = recording.train.period_ns
+    return sync_report(recording.ledger, recording.clocks, period_ns, basis, recording.readings)
+
+
+def opening_of(
+    shot: Shot, number: int, settings: RecordSettings, train: TriggerTrain
 ) -> dict[str, Any]:
+    """What a take is to be, as it stands in its folder while it is recorded.
+
+    Args:
+        shot: what is recorded.
+        number: of the take.
+        settings: rate, exposure, pre-roll and post-roll.
+        train: its triggers, counted from 0.
+    """
     return {
+        "train": dataclasses.asdict(train),
         "shot": dataclasses.asdict(shot),
         "take_number": number,
         "settings": dataclasses.asdict(settings),
-        "judgement": dataclasses.asdict(verdict),
-        "verdicts": {str(kind): count for kind, count in recording.ledger.counts().items()},
-        "clocks": {
-            name: {
-                "offset_ns": model.offset_ns,
-                "drift_ppm": model.drift_ppm,
-                "jitter_ns": model.jitter_ns,
-            }
-            for name, model in recording.clocks.items()
-        },
     }
+
+
+def manifest_of(
+    opening: Mapping[str, Any],
+    name: str,
+    devices: tuple[DeviceEntry, ...],
+    recording: Recording,
+    verdict: Judgement,
+    health: Mapping[str, Health] | None = None,
+) -> TakeManifest:
+    """The manifest of a take that has been recorded.
+
+    Args:
+        opening: of `opening_of`.
+        name: of the take.
+        devices: what their files hold.
+        recording: ledger, train and clocks.
+        verdict: on the ledger.
+        health: by device name, what it said of itself; logged, never counted on.
+    """
+    clocks = {
+        device: {
+            "offset_ns": model.offset_ns,
+            "drift_ppm": model.drift_ppm,
+            "jitter_ns": model.jitter_ns,
+        }
+        for device, model in recording.clocks.items()
+    }
+    return TakeManifest(
+        name=name,
+        kind="capture",
+        devices=devices,
+        frame_count=recording.ledger.triggers,
+        period_ns=recording.train.period_ns,
+        start_ns=recording.train.start_ns,
+        remarks={
+            "shot": opening["shot"],
+            "take_number": opening["take_number"],
+            "settings": opening["settings"],
+            "judgement": dataclasses.asdict(verdict),
+            "verdicts": {str(kind): n for kind, n in recording.ledger.counts().items()},
+            "clocks": clocks,
+            "sync": sync_of(recording).document(),
+            "health": {name: dataclasses.asdict(said) for name, said in (health or {}).items()},
+        },
+    )

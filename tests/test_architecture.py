@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import re
 import subprocess
 import sys
@@ -23,6 +24,9 @@ VENDORS = {
     "tyro": r"tools/(cli|__main__)\.py|tools/verbs/\w+\.py|tools/actor/\w+\.py|tools/\w+\.py",
     "dlib": r"track/landmark_dlib\.py",
     "dask": r"tools/engine/\w+\.py",
+    "gi": r"capture/devices/aravis/\w+\.py",
+    "textual": r"tools/terminal/\w+\.py",
+    "rich": r"tools/terminal/\w+\.py",
     "cv2": r"(recon|track|tools)/.*",
     "scipy": r"(recon|track|rig|tools)/.*",
     "numba": r"(recon|track|rig)/.*",
@@ -33,11 +37,12 @@ def sources() -> list[Path]:
     return [path for floor in FLOORS for path in sorted((ROOT / floor).rglob("*.py"))]
 
 
-def trees() -> list[tuple[str, ast.Module]]:
-    return [
+@functools.cache
+def trees() -> tuple[tuple[str, ast.Module], ...]:
+    return tuple(
         (str(path.relative_to(ROOT)), ast.parse(path.read_text(encoding="utf-8")))
         for path in sources()
-    ]
+    )
 
 
 def imported(tree: ast.Module) -> set[str]:

@@ -25,6 +25,10 @@ from tools.progress_bar import ProgressBar
 
 VERBS: dict[str, str] = {
     "demo": "run a simulated 16-camera session through every stage and report",
+    "devices": "list the devices that are found, against an array's roster; their settings",
+    "capture": "record a session: arm the array, prompt the talent, judge each take at once",
+    "flash": "check by a flash of light that every device exposes at the same trigger",
+    "reference": "keep what every device sees on calibration day, to be compared with later",
     "import": "make a take of a visiting folder of images",
     "board": "draw a calibration board to print, at true scale",
     "calibrate": "solve the cameras of an array from a board take",
@@ -43,11 +47,13 @@ VERBS: dict[str, str] = {
     "export": "write a rig, a performance or weights in an exchange format",
     "report": "write the HTML report of a take",
     "verify": "read a take back and check every frame and the ledger",
+    "recover": "bring back what a crash left of a recording",
 }
 """Every verb and what it does, in the order of the pipeline."""
 
 _MODULES = {"import": "tools.verbs.visit", "demo": "tools.verbs.demonstrate"}
 _STAGES = {
+    "capture": ("capture.preflight.run", "PreflightSettings"),
     "calibrate": ("recon.calibration.solver", "CalibrateSettings"),
     "photometric": ("recon.photometry.sources", "PhotometricSettings"),
     "drift": ("recon.calibration.drift", "DriftSettings"),

@@ -1,6 +1,7 @@
 """What a device is: three small parts - when it exposes, how it is armed, where its frames are.
 
 A simulated device and a real one have the same parts; nothing above this module knows which it has.
+What else a device can do is told by what it implements: see `capture.devices.capabilities`.
 
 References:
     The split is that of ophyd-async's detectors (trigger, arm and data logic).
@@ -14,10 +15,9 @@ from enum import StrEnum
 from typing import Protocol
 
 from capture.arrays import Image
-from capture.errors import DeviceError, SettingsError, TakeError, raise_all
+from capture.errors import SettingsError
 from capture.frame import FrameEvent
 from capture.frame_header import ImageLayout
-from capture.names import is_plain_name
 
 
 class TriggerKind(StrEnum):
@@ -29,6 +29,33 @@ class TriggerKind(StrEnum):
     FREE_RUN = "free_run"
 
 
+class ClockKind(StrEnum):
+    """Whose clock dates a device's frames."""
+
+    OWN = "own"  # the device's: it starts anywhere and drifts
+    HOST = "host"  # the host's monotonic clock, as drivers of V4L2 use
+
+
+@dataclass(frozen=True, kw_only=True)
+class ActionKeys:
+    """Which devices an action command is meant for; each is a word of 32 bits.
+
+    Attributes:
+        device_key: must equal the device's own.
+        group_key: must equal that of the device's action.
+        group_mask: the device acts when this and its own mask share a bit.
+    """
+
+    device_key: int = 1
+    group_key: int = 1
+    group_mask: int = 0xFFFFFFFF
+
+    def __post_init__(self) -> None:
+        for name in ("device_key", "group_key", "group_mask"):
+            if not 0 <= getattr(self, name) < 1 << 32:
+                raise SettingsError(f"{name} must fit 32 bits, found {getattr(self, name)}")
+
+
 @dataclass(frozen=True, kw_only=True)
 class TriggerSpec:
     """How a take is triggered.
@@ -37,11 +64,15 @@ class TriggerSpec:
         kind: what starts an exposure.
         period_ns: from trigger to trigger.
         exposure_us: how long each exposure lasts.
+        source: the input of a hardware trigger, such as "Line0"; empty for the device's own choice.
+        action: which devices act, for action commands.
     """
 
     kind: TriggerKind
     period_ns: int
     exposure_us: float
+    source: str = ""
+    action: ActionKeys = ActionKeys()
 
     def __post_init__(self) -> None:
         if self.period_ns < 1:
@@ -62,8 +93,13 @@ class DeviceInfo:
         serial: by which it is known again.
         model: maker and model.
         layout: size and pixel type of its frames.
-        id_bits: width of its frame numbers; they count from 1 and wrap to 1, as GigE Vision's.
+        id_bits: width of its frame numbers.
         triggers: what can start its exposures.
+        first_id: the number that follows the highest: 1 with GigE Vision, 0 with V4L2.
+        clock: whose clock dates its frames.
+        transport: "gige", "usb3", "v4l2", "simulated" or "replay".
+        address: by which its backend opens it.
+        link_mbps: what its link carries, Mbit/s; None when that is not known.
     """
 
     name: str
@@ -72,6 +108,11 @@ class DeviceInfo:
     layout: ImageLayout
     id_bits: int
     triggers: tuple[TriggerKind, ...]
+    first_id: int = 1
+    clock: ClockKind = ClockKind.OWN
+    transport: str = "simulated"
+    address: str = ""
+    link_mbps: float | None = None
 
 
 @dataclass(frozen=True)
@@ -109,18 +150,30 @@ class AcquireLogic(Protocol):
     def stop(self) -> None:
         """Cease to answer triggers. What has been exposed can still be fetched."""
 
-    def latch(self) -> ClockSample:
-        """Read the device's clock."""
 
+class FrameLogic(Protocol):
+    """Where a device's frames are. `pixels` and `release` may be called from any thread."""
 
-class DataLogic(Protocol):
-    """Where a device's frames are."""
+    def reserve(self, frames: int) -> None:
+        """Set memory aside for so many frames that are not yet released; called before `start`.
+
+        When all of it is taken, the device loses frames; it never overwrites one.
+
+        Raises:
+            DeviceError: when there is not so much memory.
+        """
 
     def poll(self) -> Sequence[FrameEvent]:
-        """The frames that have arrived since the last call, in their order of arrival."""
+        """The frames that have arrived since the last call, in their order of arrival.
+
+        Never waits. A device that is gone delivers nothing; it does not raise.
+        """
 
     def pixels(self, event: FrameEvent) -> Image:
-        """The image of a frame that has not been released."""
+        """The image of a frame that has not been released.
+
+        Where the device fills memory of ours this is a view of it: good until `release`.
+        """
 
     def release(self, event: FrameEvent) -> None:
         """Give the frame's memory back to the device. Every event polled must be released."""
@@ -142,12 +195,19 @@ class Device(Protocol):
         """How it is armed."""
 
     @property
-    def data(self) -> DataLogic:
+    def frames(self) -> FrameLogic:
         """Where its frames are."""
+
+    def close(self) -> None:
+        """Stop, and give the device back; a closed device may be closed again."""
 
 
 class TriggerLine(Protocol):
-    """The wire that triggers all devices of an array, and the host's clock that it goes by."""
+    """What triggers all devices of an array, and the host's clock that it goes by."""
+
+    @property
+    def fires(self) -> bool:
+        """Whether `fire` sends the triggers; False when a generator or the devices do."""
 
     def now_ns(self) -> int:
         """The host's clock."""
@@ -156,51 +216,4 @@ class TriggerLine(Protocol):
         """Return when the host's clock shows `t_ns`."""
 
     def fire(self, t_ns: int) -> None:
-        """Send an edge when the host's clock shows `t_ns`."""
-
-
-@dataclass(frozen=True, eq=False)
-class DeviceArray:
-    """The devices that are recorded together, and the line that triggers them.
-
-    Attributes:
-        devices: in a fixed order, with unique names.
-        line: triggers them all.
-    """
-
-    devices: tuple[Device, ...]
-    line: TriggerLine
-
-    def __post_init__(self) -> None:
-        names = self.names
-        problems = [
-            f"{name!r} is not safe as a file name" for name in names if not is_plain_name(name)
-        ]
-        problems += [
-            f"{name!r} is there twice" for name in sorted(set(names)) if names.count(name) > 1
-        ]
-        if not names:
-            problems.append("there must be at least one device")
-        raise_all("device array", problems, TakeError)
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the devices, in order."""
-        return tuple(device.info.name for device in self.devices)
-
-    def prepare(self, spec: TriggerSpec) -> None:
-        """Set every device up; all are tried.
-
-        Raises:
-            DeviceError: listing every device that could not, and why.
-        """
-        problems = []
-        for device in self.devices:
-            try:
-                device.trigger.prepare(spec)
-            except DeviceError as error:
-                problems.append(f"  - {device.info.name}: {error}")
-        if problems:
-            raise DeviceError(
-                "\n".join([f"{len(problems)} of {len(self.devices)} devices not ready:", *problems])
-            )
+        """Send a trigger when the host's clock shows `t_ns`."""

@@ -8,11 +8,12 @@ import numpy as np
 
 from capture.arrays import Image
 from capture.camera import Camera, CameraArray
-from capture.devices.protocol import DeviceArray
+from capture.devices.array import DeviceArray
 from capture.devices.simulated import Fault, SimulatedSettings, simulated_array
 from capture.frame_header import FrameHeader
 from capture.ledger import Ledger
-from capture.recorder import Recording, RecordSettings, record_frames
+from capture.recorder import Recording, RecordSettings
+from capture.stream import record_frames
 from tests.synthetic import small_array
 
 

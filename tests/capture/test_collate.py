@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from capture.clock_model import ClockModel
-from capture.collate import Collator, TriggerTrain
+from capture.collate import Collator, DeviceClock, TriggerTrain
 from capture.devices.protocol import DeviceInfo, TriggerKind
 from capture.devices.simulated import Fault, FaultKind, SimulatedSettings
 from capture.errors import SettingsError
@@ -18,7 +18,7 @@ from capture.ledger import Oddity, Verdict
 from capture.recorder import RecordSettings
 from tests.capture.recording import array_of, cameras, misplaced, record, verdicts
 
-PRE = RecordSettings().pre_roll
+PRE = RecordSettings().edge_triggers
 PERIOD = RecordSettings().period_ns
 
 
@@ -98,7 +98,10 @@ def test_each_fault_gets_its_verdict_and_moves_no_other_frame(case: str, seed: i
 def check_random_faults(seed: int, faults_each: int) -> None:
     """Random faults of all kinds on six devices: every verdict and every image must be right."""
     rng = np.random.default_rng(seed)
-    kinds = [kind for kind in FaultKind if kind != FaultKind.ID_RESET]
+    kinds = [
+        FaultKind.LOSE_FRAME, FaultKind.MISS_TRIGGER, FaultKind.DUPLICATE, FaultKind.STALE,
+        FaultKind.INCOMPLETE, FaultKind.CLOCK_STEP,
+    ]  # fmt: skip
     faults: dict[str, list[Fault]] = {}
     for camera in cameras(6):
         edges = rng.choice(40, size=faults_each, replace=False)
@@ -136,7 +139,7 @@ def test_frame_numbers_wrap_from_65535_to_1() -> None:
     settings = SimulatedSettings(id_bits=16)
     array = array_of(2, settings=settings)
     device = array.devices[0]
-    device._next_id = 65530  # type: ignore[attr-defined]
+    device._number = 65530  # type: ignore[attr-defined]
     recording, images = record(array)
     ids = [e.frame_id for e in recording.ledger.entries if e.device == "cam00"]
     assert 65535 in ids
@@ -178,32 +181,36 @@ INFO = DeviceInfo(
 )  # fmt: skip
 
 
-def collated(rows: list[tuple[int, float, float]], count: int = 10) -> Collator:
+def collated(rows: list[tuple[int, float, float]]) -> Collator:
     """A device's frames: number, device time in periods, arrival in periods."""
-    collator = Collator([INFO], TriggerTrain(0, 1000, count, PRE), {"cam00": ClockModel(0, 0)})
-    for frame_id, t_dev, t_host in rows:
-        collator.add(FrameEvent("cam00", frame_id, round(1000 * t_dev), round(1000 * t_host), 0))
+    collator = Collator([INFO], TriggerTrain(0, 1000), {"cam00": DeviceClock(ClockModel(0, 0))})
+    for row in rows:
+        collator.add(frame(*row))
     return collator
+
+
+def frame(frame_id: int, t_dev: float, t_host: float) -> FrameEvent:
+    return FrameEvent("cam00", frame_id, round(1000 * t_dev), round(1000 * t_host), 0)
 
 
 def test_a_device_that_restarts_numbers_and_clock_is_taken_up_again() -> None:
     before = [(100 + k, k, k + 0.5) for k in range(3)]
     after = [(1 + k, 0.3 + k - 1000, 5 + k + 0.5) for k in range(5)]  # triggers 5 to 9
-    ledger = collated(before + after).close()
+    ledger = collated(before + after).ledger(0, 10)
     assert verdicts(ledger, "cam00") == {3: "lost", 4: "lost"}
     assert [r.oddity for r in ledger.remarks] == [Oddity.CLOCK_STEP, Oddity.ID_RESET]
 
 
 def test_a_lost_frame_that_comes_late_is_stale() -> None:
     rows = [(1, 0, 0.5), (3, 2, 2.5), (2, 1, 2.6), (4, 3, 3.5)]
-    ledger = collated(rows, count=4).close()
+    ledger = collated(rows).ledger(0, 4)
     assert verdicts(ledger, "cam00") == {1: "lost"}
     assert [r.oddity for r in ledger.remarks] == [Oddity.STALE]
 
 
 def test_a_clock_that_steps_before_the_first_frame_is_found_out_by_the_arrival() -> None:
     for step in (-7.0, 0.4, 25.0, 1e6):
-        ledger = collated([(1 + k, k + step, k + 0.5) for k in range(10)]).close()
+        ledger = collated([(1 + k, k + step, k + 0.5) for k in range(10)]).ledger(0, 10)
         assert verdicts(ledger, "cam00") == {}
         assert [r.oddity for r in ledger.remarks] == [Oddity.CLOCK_STEP]
 
@@ -211,35 +218,93 @@ def test_a_clock_that_steps_before_the_first_frame_is_found_out_by_the_arrival()
 def test_a_stalled_host_does_not_make_missed_triggers_into_a_clock_step() -> None:
     rows = [(1, 0, 0.5), (2, 1, 1.5), (3, 2, 6.4), (4, 5, 6.5), (5, 6, 6.6), (6, 7, 7.5)]
     rows += [(7, 8, 8.5), (8, 9, 9.5)]
-    ledger = collated(rows).close()
+    ledger = collated(rows).ledger(0, 10)
     assert verdicts(ledger, "cam00") == {3: "missed_trigger", 4: "missed_trigger"}
     assert ledger.remarks == ()
 
 
 def test_a_number_given_twice_is_quarantined() -> None:
     rows = [(1, 0, 0.5), (2, 1, 1.5), (2, 2, 2.5), (3, 3, 3.5)]
-    ledger = collated(rows, count=4).close()
+    ledger = collated(rows).ledger(0, 4)
     assert verdicts(ledger, "cam00") == {2: "quarantined"}
     assert [r.oddity for r in ledger.remarks] == [Oddity.DUPLICATE]
 
 
 def test_some_lost_and_some_missed_is_counted_and_said() -> None:
-    ledger = collated([(1, 0, 0.5), (3, 4, 4.5)], count=5).close()
+    ledger = collated([(1, 0, 0.5), (3, 4, 4.5)]).ledger(0, 5)
     assert verdicts(ledger, "cam00") == {1: "lost", 2: "missed_trigger", 3: "missed_trigger"}
     assert ledger.entry(1, "cam00").note == "lost and missed in an unknown order"
 
 
-def test_pre_roll_and_post_roll_are_placed_and_not_wanted() -> None:
-    collator = collated([])
-    places = [
-        collator.add(FrameEvent("cam00", k + 2, 1000 * k, 1000 * k + 500, 0))
-        for k in (-1, 0, 9, 10)
-    ]
-    assert [(p.trigger_index, p.wanted) for p in places] == [
-        (-1, False), (0, True), (9, True), (10, False),
-    ]  # fmt: skip
+def test_a_ledger_of_some_triggers_is_the_part_of_the_whole() -> None:
+    gone = {3, 9, 20, 21, 35}
+    rows = [(1 + k, k, k + 0.5) for k in range(60) if k not in gone]
+    whole, window = collated(rows).ledger(0, 60), collated(rows).ledger(9, 20)
+    for k in range(20):
+        here, there = window.entry(k, "cam00"), whole.entry(9 + k, "cam00")
+        assert (here.verdict, here.frame_id, here.t_dev_ns) == (
+            there.verdict, there.frame_id, there.t_dev_ns,
+        )  # fmt: skip
+    assert verdicts(window, "cam00") == {0: "lost", 11: "lost", 12: "lost"}
 
 
-def test_a_train_without_triggers_is_refused() -> None:
-    with pytest.raises(SettingsError, match="found 1000 ns, 0"):
-        TriggerTrain(0, 1000, 0)
+def test_remarks_are_of_the_triggers_they_came_at() -> None:
+    rows = [(1 + k, k + (5000 if k >= 7 else 0), k + 0.5) for k in range(20)]
+    collator = collated(rows)
+    assert [r.trigger_index for r in collator.ledger(0, 20).remarks] == [7]
+    assert [r.trigger_index for r in collator.ledger(7, 5).remarks] == [0]
+    assert collator.ledger(0, 7).remarks == collator.ledger(8, 12).remarks == ()
+
+
+def test_forgetting_leaves_later_triggers_as_they_were() -> None:
+    rows = [(1 + k, k + (5000 if k >= 31 else 0), k + 0.5) for k in range(80) if k % 9]
+    collator, other = collated(rows), collated(rows)
+    collator.forget(30)
+    before, after = collator.ledger(30, 50), other.ledger(30, 50)
+    assert (before.entries, before.remarks) == (after.entries, after.remarks)
+    assert collator.clocks(30, 50) == other.clocks(30, 50)
+    assert collator.add(frame(81, 5080, 80.5)) == other.add(frame(81, 5080, 80.5)) == 80
+
+
+def test_a_device_found_again_is_placed_by_its_new_clock_and_its_absence_is_missing() -> None:
+    collator = collated([(100 + k, k, k + 0.5) for k in range(3)])
+    collator.restart("cam00", DeviceClock(ClockModel(-777_000, 0)))
+    for k in range(10, 15):
+        assert collator.add(frame(k - 9, k - 777, k + 0.5)) == k
+    ledger = collator.ledger(0, 15)
+    assert verdicts(ledger, "cam00") == dict.fromkeys(range(3, 10), "missing")
+    assert ledger.remarks == ()
+
+
+def test_numbers_that_count_from_0_wrap_to_0() -> None:
+    info = replace(INFO, id_bits=32, first_id=0)
+    collator = Collator([info], TriggerTrain(0, 1000), {"cam00": DeviceClock(ClockModel(0, 0))})
+    for k in range(4):
+        assert collator.add(frame((2**32 - 2 + k) % 2**32, k, k + 0.5)) == k
+    assert collator.ledger(0, 4).remarks == ()
+
+
+def test_a_clock_that_is_believed_shows_what_a_fitted_one_hides() -> None:
+    late = [(1 + k, k + 0.1, k + 0.5) for k in range(10)]
+    fitted = collated(late).ledger(0, 10)
+    believed = Collator(
+        [INFO], TriggerTrain(0, 1000), {"cam00": DeviceClock(ClockModel(0, 0), fitted=False)}
+    )
+    for row in late:
+        believed.add(frame(*row))
+    assert [e.t_ns for e in fitted.entries] == [1000 * k for k in range(10)]
+    assert [e.t_ns for e in believed.ledger(0, 10).entries] == [1000 * k + 100 for k in range(10)]
+
+
+def test_a_host_that_is_late_by_turns_does_not_hide_a_missed_trigger() -> None:
+    lags = [0.1, 0.8, 0.9, 0.8, 0.7, 0.9, 0.8, 0.1]  # the last is sooner than most, and no jump
+    rows = [(1 + k, k, k + lag) for k, lag in enumerate(lags[:-1])]
+    rows += [(8, 8, 8 + lags[-1]), (9, 9, 9.2)]
+    ledger = collated(rows).ledger(0, 10)
+    assert verdicts(ledger, "cam00") == {7: "missed_trigger"}
+    assert ledger.remarks == ()
+
+
+def test_a_train_without_a_period_is_refused() -> None:
+    with pytest.raises(SettingsError, match="found 0 ns"):
+        TriggerTrain(0, 0)

@@ -201,17 +201,21 @@ def test_other_bytes_are_no_header(data: bytes) -> None:
         FrameHeader.unpack(data)
 
 
-def test_an_interrupted_writer_leaves_nothing(tmp_path: Path) -> None:
+def test_an_interrupted_writer_keeps_its_frames_until_they_are_discarded(tmp_path: Path) -> None:
     layout = LAYOUTS[0]
+    frames = images(layout)
+    writer = FrameWriter(tmp_path / "a.mcap", "cam07", layout)
 
     def interrupted() -> None:
-        with FrameWriter(tmp_path / "a.mcap", "cam07", layout) as writer:
-            writer.write(FrameHeader(0), images(layout)[0])
-            assert (tmp_path / "a.mcap.partial").exists()
+        with writer:
+            writer.write(FrameHeader(0), frames[0])
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         interrupted()
+    assert [path.name for path in tmp_path.iterdir()] == ["a.mcap.partial"]
+    assert np.array_equal(FrameReader(tmp_path / "a.mcap.partial").read(0), frames[0])
+    writer.discard()
     assert not list(tmp_path.iterdir())
 
 

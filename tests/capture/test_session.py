@@ -14,10 +14,11 @@ from capture.errors import DeviceError, SettingsError, TakeError, WorkError
 from capture.recorder import RecordSettings
 from capture.session import Session, Shot, ShotList, record_take
 from capture.take import Take
+from capture.take_notes import NoteBook, OperatorNote, TakeStatus
 from capture.verify import verify_take
 from tests.capture.recording import array_of, cameras, stamp
 
-PRE = RecordSettings().pre_roll
+PRE = RecordSettings().edge_triggers
 SMILE = Shot(slate="smile", kind="expression", frames=6, start_ns=5 * 10**9)
 
 
@@ -45,8 +46,10 @@ def test_a_take_holds_what_the_scene_showed_at_each_trigger(tmp_path: Path) -> N
     )
     assert note.sentence == "All 6 frame sets of 4 devices are complete."
     assert sorted(path.name for path in take.folder.iterdir()) == [
+        "check.json",
         "frames",
         "ledger.csv",
+        "manifest-sha256.txt",
         "take.json",
     ]
 
@@ -112,6 +115,7 @@ def test_the_same_array_and_shot_give_the_same_bytes(tmp_path: Path) -> None:
             Session.create(tmp_path / name), SMILE, array_of(seed=3), RecordSettings()
         )
         files = sorted(p for p in take.folder.rglob("*") if p.is_file())
+        files = [path for path in files if path.name != "check.json"]  # says when it was checked
         contents.append({str(p.relative_to(take.folder)): p.read_bytes() for p in files})
     assert contents[0] == contents[1]
 
@@ -245,3 +249,29 @@ def test_a_take_that_does_not_say_what_was_recorded_is_named(
     path.write_text(json.dumps(document))
     with pytest.raises(TakeError, match=r"smile_001/take\.json: damaged manifest: remarks must"):
         session.takes()
+
+
+def test_the_take_that_the_operator_kept_counts_though_a_later_one_stands_there(
+    tmp_path: Path,
+) -> None:
+    session = Session.create(tmp_path / "s")
+    for _ in range(3):
+        record_take(session, SMILE, array_of(), RecordSettings())
+    assert session.take("smile").name == "smile_003"
+    book = NoteBook.of_session(session.folder)
+    book.write("smile_003", OperatorNote(status=TakeStatus.RETAKE))
+    assert session.take("smile").name == "smile_002"
+    book.write("smile_001", OperatorNote(status=TakeStatus.KEEP))
+    assert session.take("smile").name == "smile_001"
+
+
+def test_the_hold_is_counted_from_the_key_and_not_from_the_pre_roll(tmp_path: Path) -> None:
+    shot = Shot(slate="smile", kind="expression", frames=20, hold=(8, 12))
+    settings = RecordSettings(pre_roll=10, post_roll=5)
+    for at, colour in ((8, "amber"), (18, "red"), (22, "red"), (23, "amber")):
+        faults = {"cam02": [Fault(FaultKind.LOSE_FRAME, PRE + at)]}
+        take = record_take(
+            Session.create(tmp_path / str(at)), shot, array_of(faults=faults), settings
+        )
+        assert take.manifest.frame_count == 35
+        assert take.manifest.remarks["judgement"]["colour"] == colour

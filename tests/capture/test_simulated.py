@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from capture.arrays import Image
 from capture.camera import Camera
-from capture.devices.protocol import DeviceArray, TriggerKind, TriggerSpec
+from capture.devices.array import DeviceArray
+from capture.devices.protocol import TriggerKind, TriggerSpec
 from capture.devices.simulated import (
     Fault,
     FaultKind,
@@ -69,14 +72,14 @@ def test_frames_of_one_device_arrive_in_order_whatever_the_jitter() -> None:
 
 def test_devices_of_an_array_deliver_out_of_order_among_each_other() -> None:
     array = array_of(6)
-    array.prepare(SPEC)
+    array.prepare(SPEC.period_ns, SPEC.exposure_us)
     events: list[FrameEvent] = []
     for device in array.devices:
         device.acquire.start()
     for k in range(1, 9):
         array.line.fire(10_000_000 * k)
         for device in array.devices:
-            events += device.data.poll()
+            events += device.frames.poll()
     order = [event.device for event in sorted(events, key=lambda event: event.t_host_ns)]
     assert order[:6] != sorted(order[:6])
     assert len({event.t_dev_ns // 10**9 for event in events}) > 3  # clocks seconds apart
@@ -91,6 +94,10 @@ def test_devices_of_an_array_deliver_out_of_order_among_each_other() -> None:
         (FaultKind.STALE, [1, 2, 3, 1, 4, 5], 6),
         (FaultKind.INCOMPLETE, [1, 2, 3, 4, 5], 4),
         (FaultKind.ID_RESET, [1, 2, 1, 2, 3], 5),
+        (FaultKind.ID_JUMP, [1, 2, 65532, 65533, 65534], 5),
+        (FaultKind.CLOCK_DRIFT, [1, 2, 3, 4, 5], 5),
+        (FaultKind.FREEZE, [1, 2, 4, 5], 4),
+        (FaultKind.DEATH, [1, 2], 2),
     ],
 )
 def test_each_fault_does_what_it_says(kind: FaultKind, ids: list[int], complete: int) -> None:
@@ -113,6 +120,20 @@ def test_a_clock_step_stays() -> None:
     ]  # fmt: skip
 
 
+def test_a_fault_that_is_put_in_while_it_runs_hits_the_next_edge_once() -> None:
+    line, device, _ = one(SimulatedSettings())
+    line.fire(0)
+    device.inject(Fault(FaultKind.LOSE_FRAME, triggers=2))
+    for k in range(1, 5):
+        line.fire(10_000_000 * k)
+    line.wait(10**9)
+    assert [event.frame_id for event in device.poll()] == [1, 4, 5]
+    device.start()
+    line.fire(10**9)
+    line.wait(2 * 10**9)
+    assert [event.frame_id for event in device.poll()] == [6]
+
+
 def test_a_latch_brackets_the_clock() -> None:
     line, device, _ = one(SimulatedSettings(clock=Clock(offset_ns=10**9)))
     line.wait(5_000_000)
@@ -133,7 +154,7 @@ def test_what_a_device_cannot_do_is_said_for_every_device() -> None:
     with pytest.raises(
         DeviceError, match=r"2 of 2 devices not ready:\n.*cam00: asked for action .*\n"
     ):
-        array.prepare(TriggerSpec(kind=TriggerKind.ACTION, period_ns=10**7, exposure_us=10))
+        replace(array, trigger=TriggerKind.ACTION).prepare(10**7, 10)
     with pytest.raises(DeviceError, match="cam00: started before it was prepared"):
         SimulatedDevice(cameras(1)[0], StampScene(), SimulatedLine(), SimulatedSettings()).start()
 

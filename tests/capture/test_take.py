@@ -16,6 +16,7 @@ from capture.camera import CameraArray
 from capture.errors import CameraError, TakeError
 from capture.frame_header import FrameHeader, ImageLayout
 from capture.manifest import TakeManifest, read_manifest
+from capture.mcap import FrameReader
 from capture.take import Take
 from capture.take_writer import TakeWriter
 from tests.capture.refusals import refusal
@@ -194,9 +195,7 @@ def test_any_bytes_are_read_or_refused_but_never_crash(
 
 
 @pytest.mark.parametrize("error", [TakeError, KeyboardInterrupt])
-def test_an_interrupted_writer_leaves_no_frame_file(
-    tmp_path: Path, error: type[BaseException]
-) -> None:
+def test_an_interrupted_writer_keeps_its_frames(tmp_path: Path, error: type[BaseException]) -> None:
     def fail() -> None:
         with TakeWriter(tmp_path / "take", {"cam00": LAYOUT}) as writer:
             writer.write("cam00", FrameHeader(0), image(0, 0))
@@ -204,7 +203,9 @@ def test_an_interrupted_writer_leaves_no_frame_file(
 
     with pytest.raises(error):
         fail()
-    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
+    files = [path for path in tmp_path.rglob("*") if path.is_file()]
+    assert [path.name for path in files] == ["cam00.mcap.partial"]
+    assert np.array_equal(FrameReader(files[0]).read(0), image(0, 0))
 
 
 def test_a_manifest_that_claims_a_giant_image_is_refused(folder: Path) -> None:

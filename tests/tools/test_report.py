@@ -27,7 +27,7 @@ from tools.report import (
     write_scan_page,
 )
 
-PRE = RecordSettings().pre_roll
+PRE = RecordSettings().edge_triggers
 SMILE = Shot(slate="smile", kind="expression", frames=6, start_ns=5 * 10**9)
 _VOID = {"meta", "img", "input", "br", "rect", "line", "path", "circle"}
 

@@ -1,20 +1,24 @@
-"""The recording of each take: its verdict, its ledger as a matrix, its clocks and image levels."""
+"""The recording of each take: verdict, ledger, synchronization, clocks, image levels."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from datetime import datetime
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from capture.calibration_link import calibration_standing, read_link
 from capture.judgement import Colour, judge
 from capture.ledger import Ledger, read_ledger
 from capture.ledger import Verdict as Fate
 from capture.take import Take
 from tools.report.charts import Labels, bar_chart, matrix_chart
 from tools.report.inputs import ReportInputs, TakeInputs
-from tools.report.page import Section, Verdict, figure, folded, table
+from tools.report.page import Section, Verdict, facts, figure, folded, table
 from tools.report.svg import escape
+from tools.report.sync import sync_facts, sync_part, sync_verdict
 
 _FATES = {
     Fate.OK: "#9fd3b8",
@@ -30,8 +34,10 @@ _STEP = 4  # every fourth pixel of every fourth row is enough for a mean
 
 
 def capture_section(inputs: ReportInputs) -> list[Section]:
-    """Each take's ledger as a matrix of triggers and devices, its clocks, its image levels."""
-    parts, verdicts, rows = [], [], []
+    """Each take's ledger as a matrix of triggers and devices, its sync, its clocks, its levels."""
+    verdicts, linked = calibration_link(inputs)
+    parts: list[str] = []
+    rows: list[dict[str, object]] = []
     for item in inputs.takes:
         path = item.folder / "ledger.csv"
         if not path.is_file():
@@ -39,14 +45,20 @@ def capture_section(inputs: ReportInputs) -> list[Section]:
         ledger = read_ledger(path)
         verdict = take_verdict(item.take, ledger)
         verdicts.append(verdict)
+        remarks = item.take.manifest.remarks
+        sync = sync_verdict(item.take.name, remarks)
+        if sync is not None and sync.level != "good":
+            verdicts.append(sync)
         rows.append({"take": item.take.name} | _facts(item, ledger))
         chart = figure(
             _matrix(item.take.name, ledger),
             "Every trigger of every device has exactly one verdict.",
         )
+        chart += sync_part(item.take.name, remarks, ledger)
         devices = _devices(item.take)
-        if verdict.level == "good" and len(inputs.takes) > 1:
-            parts.append(folded(f"{item.take.name}: ledger, levels, clocks", chart + devices))
+        good = verdict.level == "good" and (sync is None or sync.level == "good")
+        if good and len(inputs.takes) > 1:
+            parts.append(folded(f"{item.take.name}: ledger, sync, levels, clocks", chart + devices))
         else:
             inner = folded("levels and clocks of the devices", devices)
             parts.append(f"<h3>{escape(item.take.name)}</h3>{chart}{inner}")
@@ -54,8 +66,36 @@ def capture_section(inputs: ReportInputs) -> list[Section]:
         return []
     head = list(dict.fromkeys(key for row in rows for key in row))
     cells = [[row.get(key, "") for key in head] for row in rows]
-    body = table(head, cells) + "".join(parts)
+    body = table(head, cells) + linked + "".join(parts)
     return [Section(anchor="capture", title="Capture", body=body, verdicts=tuple(verdicts))]
+
+
+def calibration_link(inputs: ReportInputs) -> tuple[list[Verdict], str]:
+    """Which calibration the session of the takes uses and how old it was: verdict and HTML."""
+    for item in inputs.takes:
+        session = item.folder.resolve().parent.parent
+        if not (session / "session.json").is_file():
+            continue
+        link = read_link(session)
+        if link is None:
+            continue
+        began = datetime.fromisoformat(link.linked)
+        standing = calibration_standing(session, item.take.device_names, now=began)
+        verdict = Verdict(
+            level=_LEVELS[standing.colour], subject="Calibration of the session:",
+            words=f"{standing.sentence} {standing.remedy}".strip(),
+        )  # fmt: skip
+        values: dict[str, object] = {
+            "calibration": link.id,
+            "made": link.made,
+            "age when linked, days": link.age_days(began),
+            "cameras": len(link.devices),
+            "pictures of calibration day": link.has_reference,
+            "from": Path(link.source).name,
+        }
+        told = [] if standing.colour == Colour.GREEN else [verdict]
+        return told, f"<h3>Calibration of the session</h3>{facts(values)}"
+    return [], ""
 
 
 def take_verdict(take: Take, ledger: Ledger) -> Verdict:
@@ -107,7 +147,10 @@ def _facts(item: TakeInputs, ledger: Ledger) -> dict[str, object]:
     if exposure is not None:
         values["exposure, us"] = exposure
     spread = _part(manifest.remarks, "judgement").get("spread_ns")
-    if isinstance(spread, int) and spread >= 0:
+    sync = sync_facts(manifest.remarks)
+    if sync:
+        values |= sync
+    elif isinstance(spread, int) and spread >= 0:
         values["spread, us"] = spread / 1000.0
     for fate, count in ledger.counts().items():
         if count:

@@ -1,20 +1,24 @@
-"""Read a take back and check every frame's CRC and the ledger's sums.
+"""Read takes back from the disk: every frame's CRC, every file's hash, the ledger's sums.
 
-Example: likeness verify takes/smile
+A take, or a session: then every take of it, one line each.
+Example: likeness verify sessions/monday/takes/smile_001
 """
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import tyro
 
-from capture.errors import WorkError
+from capture.durable import FolderLock
+from capture.errors import TakeError, WorkError
 from capture.progress import Progress
-from capture.take import Take
-from capture.verify import verify_take
+from capture.session import Session
+from capture.take import MANIFEST, Take
+from capture.verify import VerifyReport, VerifySettings, verify_take
 from tools.verbs.options import Options
 
 
@@ -23,7 +27,7 @@ class Arguments(Options):
     """Options of `likeness verify`."""
 
     take: tyro.conf.Positional[Path]
-    """The take."""
+    """The take, or a session."""
 
 
 def run(arguments: Arguments, progress: Progress) -> dict[str, Any]:
@@ -32,9 +36,58 @@ def run(arguments: Arguments, progress: Progress) -> dict[str, Any]:
     Raises:
         WorkError: listing everything that is not as it was written.
     """
-    found = verify_take(Take.open(arguments.take), progress=progress)
+    if (arguments.take / "session.json").is_file():
+        return _verify_session(arguments.take, progress)
+    found = _verify(arguments.take, progress)
     if not found.sound:
-        lines = "\n".join(f"  - {problem}" for problem in found.problems)
-        raise WorkError(f"{arguments.take}: {len(found.problems)} problems\n{lines}")
+        raise WorkError(f"{arguments.take}: {_listed(found.problems)}")
+    return {"take": str(arguments.take), **_figures(found)}
+
+
+def _verify_session(folder: Path, progress: Progress) -> dict[str, Any]:
+    Session.open(folder)
+    takes: list[dict[str, Any]] = []
+    problems: list[str] = []
+    for place in sorted(path for path in (folder / "takes").iterdir() if path.is_dir()):
+        if place.name.startswith("."):
+            continue
+        if place.suffix == ".partial":
+            said = _unfinished(place, problems)
+        elif (place / MANIFEST).is_file():
+            try:
+                found = _verify(place, progress)
+            except TakeError as error:
+                found = VerifyReport(0, {}, (str(error),))
+            problems += [f"{place.name}: {problem}" for problem in found.problems]
+            takes.append({"take": place.name, **_figures(found)})
+            said = "sound" if found.sound else f"{len(found.problems)} problems"
+            said = f"{said}, {found.frames} frames"
+        else:
+            continue
+        print(f"{place.name}: {said}", file=sys.stderr)
+    if problems:
+        raise WorkError(f"{folder}: {_listed(problems)}")
+    frames = sum(take["frames"] for take in takes)
+    return {"session": str(folder), "sound": True, "frames": frames, "takes": len(takes)}
+
+
+def _unfinished(folder: Path, problems: list[str]) -> str:
+    with FolderLock(folder) as lock:
+        if not lock.held:
+            return "being recorded now"
+    problems.append(f"{folder.name}: was never finished; run `likeness recover {folder}`")
+    return "not finished"
+
+
+def _verify(folder: Path, progress: Progress) -> VerifyReport:
+    return verify_take(Take.open(folder), VerifySettings(from_disk=True), progress=progress)
+
+
+def _figures(found: VerifyReport) -> dict[str, Any]:
     verdicts = {str(verdict): count for verdict, count in found.verdicts.items()}
-    return {"take": str(arguments.take), "sound": True, "frames": found.frames, **verdicts}
+    return {"sound": found.sound, "frames": found.frames, **verdicts}
+
+
+def _listed(problems: tuple[str, ...] | list[str]) -> str:
+    lines = "\n".join(f"  - {problem}" for problem in problems)
+    return f"{len(problems)} problem{'s' if len(problems) > 1 else ''}\n{lines}"

@@ -1,4 +1,4 @@
-"""Simulated devices: their own clocks, latencies and faults, pixels from a scene.
+"""Simulated devices in virtual time: their own clocks, latencies and faults, pixels from a scene.
 
 Time is virtual: it stands still while a scene renders. A device renders nothing itself. It asks its
 scene for the pixels when they are fetched, one image at a time from the thread that fetches; a
@@ -9,92 +9,22 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from enum import StrEnum
-from importlib import metadata
-from typing import Any, Protocol
+from dataclasses import replace
 
 import numpy as np
 
 from capture.arrays import Image
 from capture.camera import Camera, CameraArray
-from capture.devices.protocol import ClockSample, DeviceArray, DeviceInfo, TriggerKind, TriggerSpec
+from capture.devices.array import DeviceArray
+from capture.devices.faults import Exposure, Fault, FaultBook
+from capture.devices.protocol import ClockSample, DeviceInfo, TriggerKind, TriggerSpec
+from capture.devices.simulated.scene import Scene
+from capture.devices.simulated.settings import SimulatedSettings
 from capture.errors import DeviceError, SettingsError
 from capture.frame import Clock, FrameEvent
 from capture.frame_header import ImageLayout
 
-SCENE_GROUP = "likeness.scenes"
-
 _LATCH_NS = 200_000  # a register read over the network takes about this long
-
-
-class Scene(Protocol):
-    """What simulated devices look at."""
-
-    def render(self, camera: Camera, t_ns: int) -> Image:
-        """The image that `camera` takes at the true time `t_ns`, noise of the sensor included."""
-
-
-class FaultKind(StrEnum):
-    """What can go wrong at one trigger."""
-
-    LOSE_FRAME = "lose_frame"  # exposed and numbered, never delivered
-    MISS_TRIGGER = "miss_trigger"  # not exposed, not numbered
-    DUPLICATE = "duplicate"  # delivered twice
-    STALE = "stale"  # the frame of two triggers ago is delivered once more, after the new one
-    INCOMPLETE = "incomplete"  # delivered with parts missing
-    CLOCK_STEP = "clock_step"  # the device's clock jumps by `amount_ns`, from here on
-    ID_RESET = "id_reset"  # the device's numbers begin again at 1
-
-
-@dataclass(frozen=True)
-class Fault:
-    """One thing that goes wrong.
-
-    Attributes:
-        kind: what.
-        edge: at which edge of the trigger line since the device was started, counted from 0.
-        amount_ns: how far a clock steps.
-    """
-
-    kind: FaultKind
-    edge: int
-    amount_ns: int = 0
-
-
-@dataclass(frozen=True, kw_only=True)
-class SimulatedSettings:
-    """How a simulated device behaves.
-
-    Attributes:
-        clock: its own clock.
-        latency_ms: from the end of an exposure to the arrival of the frame.
-        latency_jitter_ms: standard deviation of that, one-sided.
-        id_bits: width of its frame numbers, 8 to 64.
-        first_id: the first frame's number.
-        faults: what goes wrong.
-        channels: 1 mono, 3 RGB.
-        dtype: "uint8" or "uint16".
-        seed: of the latency.
-    """
-
-    clock: Clock = field(default_factory=Clock)
-    latency_ms: float = 6.0
-    latency_jitter_ms: float = 0.5
-    id_bits: int = 16
-    first_id: int = 1
-    faults: tuple[Fault, ...] = ()
-    channels: int = 1
-    dtype: str = "uint8"
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        if not 8 <= self.id_bits <= 64:
-            raise SettingsError(f"id_bits must lie in 8..64, found {self.id_bits}")
-        if not 1 <= self.first_id < 1 << self.id_bits:
-            raise SettingsError(f"first_id must fit {self.id_bits} bits, found {self.first_id}")
-        if not (self.latency_ms >= 0 and self.latency_jitter_ms >= 0):
-            raise SettingsError("latency_ms and latency_jitter_ms must be 0 or more")
 
 
 class SimulatedLine:
@@ -102,6 +32,7 @@ class SimulatedLine:
 
     def __init__(self) -> None:
         self._now_ns = 0
+        self.fires = True
         self._devices: list[SimulatedDevice] = []
 
     def connect(self, device: SimulatedDevice) -> None:
@@ -145,19 +76,18 @@ class SimulatedDevice:
             layout=ImageLayout(camera.width, camera.height, settings.channels, settings.dtype),
             id_bits=settings.id_bits,
             triggers=(TriggerKind.HARDWARE,),
+            first_id=settings.wraps_to,
         )
         self._scene, self._line, self._settings = scene, line, settings
         self._random = np.random.default_rng((settings.seed, 0x5EED))
         self._spec: TriggerSpec | None = None
         self._running = False
-        self._edge = 0
-        self._next_id = settings.first_id
-        self._clock = settings.clock
+        self._book = FaultBook(settings.id_bits, settings.wraps_to, settings.faults)
+        self._number = settings.first_id
         self._arrival_ns = 0
         self._slot = 0
         self._pending: list[tuple[int, int, FrameEvent]] = []
         self._exposed: dict[int, int] = {}  # true time of exposure, by slot
-        self._history: list[tuple[FrameEvent, int]] = []
         line.connect(self)
 
     @property
@@ -171,9 +101,16 @@ class SimulatedDevice:
         return self
 
     @property
-    def data(self) -> SimulatedDevice:
+    def frames(self) -> SimulatedDevice:
         """Where its frames are."""
         return self
+
+    def reserve(self, frames: int) -> None:
+        """Nothing to do: a scene renders a frame when it is fetched."""
+
+    def close(self) -> None:
+        """Cease to answer edges."""
+        self.stop()
 
     def prepare(self, spec: TriggerSpec) -> None:
         """Set the device up for hardware triggers."""
@@ -187,10 +124,10 @@ class SimulatedDevice:
         """Begin to answer edges; they are counted from 0 again."""
         if self._spec is None:
             raise DeviceError(f"{self.info.name}: started before it was prepared")
-        self._running, self._edge, self._arrival_ns = True, 0, 0
+        self._running, self._arrival_ns = True, 0
+        self._book.begin()
         self._pending.clear()
         self._exposed.clear()
-        self._history.clear()
 
     def stop(self) -> None:
         """Cease to answer edges."""
@@ -200,41 +137,29 @@ class SimulatedDevice:
         """Read the device's clock; the answer takes a while, of which the device's share varies."""
         before = self._line.now_ns()
         share = float(self._random.uniform(0.3, 0.7))
-        return ClockSample(
-            self._clock.read(before + round(share * _LATCH_NS)), before, before + _LATCH_NS
-        )
+        t_ns = before + round(share * _LATCH_NS)
+        return ClockSample(self._clock_ns(t_ns), before, before + _LATCH_NS)
+
+    def inject(self, fault: Fault) -> None:
+        """Let something go wrong, at the next edge unless the fault names another."""
+        self._book.inject(fault)
 
     def edge(self, t_ns: int) -> None:
         """An edge on the trigger line at the true time `t_ns`."""
         if not self._running or self._spec is None:
             return
-        faults = {fault.kind: fault for fault in self._settings.faults if fault.edge == self._edge}
-        self._edge += 1
-        if FaultKind.CLOCK_STEP in faults:
-            step = faults[FaultKind.CLOCK_STEP].amount_ns
-            self._clock = replace(self._clock, offset_ns=self._clock.offset_ns + step)
-        if FaultKind.ID_RESET in faults:
-            self._next_id = 1
-        if FaultKind.MISS_TRIGGER in faults:
-            return
-        frame_id, self._next_id = self._next_id, self._following(self._next_id)
         exposure_us = self._spec.exposure_us
+        t_dev_ns = self._settings.clock.read(t_ns)
+        would = Exposure(self._book.edge, t_ns, self._number, t_dev_ns, exposure_us)
+        self._number += 1
+        outcome = self._book.trigger(t_ns, would)
+        if not outcome.exposed:
+            return
         latency = self._settings.latency_ms + self._settings.latency_jitter_ms * abs(
             self._random.standard_normal()
         )
-        arrival = t_ns + round(1000 * exposure_us + 1e6 * latency)
-        event = FrameEvent(
-            self.info.name, frame_id, self._clock.read(t_ns), arrival, 0, exposure_us,
-            FaultKind.INCOMPLETE not in faults,
-        )  # fmt: skip
-        self._history = [*self._history[-2:], (event, t_ns)]
-        if FaultKind.LOSE_FRAME in faults:
-            return
-        self._deliver(event, t_ns)
-        if FaultKind.DUPLICATE in faults:
-            self._deliver(event, t_ns)
-        if FaultKind.STALE in faults:
-            self._deliver(*self._history[0])
+        for exposure in outcome.sent:
+            self._deliver(exposure, t_ns + round(1000 * exposure_us + 1e6 * latency))
 
     def poll(self) -> Sequence[FrameEvent]:
         """The frames that have arrived by now."""
@@ -257,16 +182,19 @@ class SimulatedDevice:
         """Forget the frame."""
         del self._exposed[event.slot]
 
-    def _deliver(self, event: FrameEvent, t_ns: int) -> None:
-        # Frames of one device arrive in the order it sent them, whatever the jitter.
-        self._arrival_ns = max(event.t_host_ns, self._arrival_ns + 1)
-        self._slot += 1
-        self._exposed[self._slot] = t_ns
-        event = replace(event, t_host_ns=self._arrival_ns, slot=self._slot)
-        heapq.heappush(self._pending, (self._arrival_ns, self._slot, event))
+    def _clock_ns(self, t_ns: int) -> int:
+        return self._book.clock_ns(t_ns, self._settings.clock.read(t_ns))
 
-    def _following(self, frame_id: int) -> int:
-        return 1 if frame_id + 1 >= 1 << self._settings.id_bits else frame_id + 1
+    def _deliver(self, exposure: Exposure, arrival_ns: int) -> None:
+        # Frames of one device arrive in the order it sent them, whatever the jitter.
+        self._arrival_ns = max(arrival_ns, self._arrival_ns + 1)
+        self._slot += 1
+        self._exposed[self._slot] = exposure.t_ns
+        event = FrameEvent(
+            self.info.name, exposure.number, exposure.t_dev_ns, self._arrival_ns, self._slot,
+            exposure.exposure_us, exposure.complete,
+        )  # fmt: skip
+        heapq.heappush(self._pending, (self._arrival_ns, self._slot, event))
 
 
 def simulated_array(
@@ -315,15 +243,3 @@ def simulated_array(
         )
         devices.append(SimulatedDevice(camera, scene, line, own))
     return DeviceArray(tuple(devices), line)
-
-
-def load_scene(name: str) -> Any:
-    """The function that opens the scene called `name`, found by entry point `likeness.scenes`.
-
-    Raises:
-        SettingsError: naming the scenes that are installed.
-    """
-    found = {entry.name: entry for entry in metadata.entry_points(group=SCENE_GROUP)}
-    if name not in found:
-        raise SettingsError(f"no scene {name!r}; installed: {', '.join(sorted(found)) or 'none'}")
-    return found[name].load()

@@ -1,0 +1,106 @@
+"""Threads that carry frames to disk, in lanes: the frames of one device stay in their order.
+
+A lane is two threads: one computes the CRC of the pixels, one writes. Both spend their time in code
+that lets other threads run. What waits in a lane is held in its device's memory, so that a slow
+disk shows as memory in use, and, when that is full, as frames lost by the device: never as a frame
+that nobody knows of.
+"""
+
+from __future__ import annotations
+
+import os
+import queue
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from capture.arrays import Image
+from capture.crc import crc32
+from capture.errors import DeviceError, WorkError
+from capture.window import HeldFrame
+
+Write = Callable[[HeldFrame, Image, int], None]
+Failed = Callable[[HeldFrame, str], None]
+
+
+@dataclass(frozen=True)
+class LaneJob:
+    """One frame on its way to disk.
+
+    Attributes:
+        frame: is given back afterwards, whatever happens.
+        write: given the frame, its pixels and their CRC.
+        failed: told why, when the frame could not be fetched or written.
+    """
+
+    frame: HeldFrame
+    write: Write
+    failed: Failed
+
+
+class WriteLanes:
+    """Some lanes; every device keeps to one of them."""
+
+    def __init__(self, lanes: int | None = None) -> None:
+        """Start the threads.
+
+        Args:
+            lanes: how many; None: one for every two cores, at most 4.
+        """
+        count = lanes if lanes is not None else max(1, min(4, (os.cpu_count() or 2) // 2))
+        self._lanes = [_Lane() for _ in range(count)]
+
+    def put(self, place: int, job: LaneJob) -> None:
+        """Send a frame on its way.
+
+        Args:
+            place: of its device in the array.
+            job: what is to be done.
+        """
+        self._lanes[place % len(self._lanes)].put(job)
+
+    def close(self) -> None:
+        """Finish all that waits, and end the threads."""
+        for lane in self._lanes:
+            lane.close()
+
+
+class _Lane:
+    def __init__(self) -> None:
+        self._fresh: queue.SimpleQueue[LaneJob | None] = queue.SimpleQueue()
+        self._ready: queue.SimpleQueue[tuple[LaneJob, Image, int] | None] = queue.SimpleQueue()
+        self._threads = [
+            threading.Thread(target=work, name=name, daemon=True)
+            for work, name in ((self._check, "likeness-crc"), (self._write, "likeness-write"))
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    def put(self, job: LaneJob) -> None:
+        self._fresh.put(job)
+
+    def close(self) -> None:
+        self._fresh.put(None)
+        for thread in self._threads:
+            thread.join()
+
+    def _check(self) -> None:
+        while (job := self._fresh.get()) is not None:
+            try:
+                pixels = job.frame.device.frames.pixels(job.frame.event)
+                self._ready.put((job, pixels, crc32(pixels.reshape(-1).view("u1"))))
+            except DeviceError as error:
+                job.failed(job.frame, str(error))
+                job.frame.done()
+        self._ready.put(None)
+
+    def _write(self) -> None:
+        while (ready := self._ready.get()) is not None:
+            job, pixels, crc = ready
+            del ready
+            try:
+                job.write(job.frame, pixels, crc)
+            except WorkError as error:
+                job.failed(job.frame, str(error))
+            finally:
+                job.frame.done()

@@ -24,11 +24,11 @@ test-slow: setup ## the tests that take more than a minute
 
 test-gige: setup ## real Aravis against sixteen fake GigE Vision devices and one of our own; wants root
 	@sh tools/setup_gige.sh || echo "test-gige: goes on with what is there; a test that lacks something says so" >&2
-	@$(PYTHON) -m pytest -rs -m "gige"
+	@$(PYTHON) -m pytest -rs -m "gige" tests/gige
 
 test-v4l2: setup ## the kernel's vivid driver in a QEMU guest
 	@sh tools/setup_v4l2.sh
-	@$(PYTHON) -m pytest -rs -m "v4l2"
+	@$(PYTHON) -m pytest -rs -m "v4l2" tests/v4l2
 
 test-landmarks: setup ## the 68-point detector on the simulated actor; read docs/licences.md first
 	@$(PYTHON) -m pip install --quiet --disable-pip-version-check "face_recognition_models==0.3.0"

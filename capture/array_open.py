@@ -13,6 +13,7 @@ from capture.devices.lines import ActionLine, HostLine, SoftwareLine
 from capture.devices.preset import apply_preset, read_preset
 from capture.devices.protocol import Device, TriggerKind, TriggerLine
 from capture.errors import DeviceError, ExtraError, InputError, SettingsError
+from capture.names import named
 
 _FORMATS = {
     ("Mono8", "GREY"): (1, "uint8"),
@@ -64,7 +65,7 @@ def _raise(file: ArrayFile, problems: list[tuple[str, DeviceError | InputError]]
         return
     if all(isinstance(error, ExtraError) for _, error in problems):
         raise problems[0][1]
-    lines = "\n".join(f"  - {name}: {error}" for name, error in problems)
+    lines = "\n".join(f"  - {named(name, error)}" for name, error in problems)
     raise DeviceError(
         f"array {file.name!r}: {len(problems)} of {len(file.devices)} devices could not be opened; "
         f"`likeness devices --array` compares them with what is found\n{lines}"
@@ -83,7 +84,7 @@ def _opened(
                     "the array file"
                 )
             for difference in apply_preset(device, read_preset(entry.preset)):
-                told(f"{entry.name}: {entry.preset.name}: {difference}")
+                told(named(entry.name, f"{entry.preset.name}: {difference}"))
         if file.ptp and isinstance(device, PtpClocked):
             device.enable_ptp(True)
         _check(entry, file, device)

@@ -10,7 +10,6 @@ with x_cam = R x_world + t, OpenCV axes, pixel centres at integers.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -18,11 +17,10 @@ from typing import Any
 import numpy as np
 
 from capture.camera import Camera, CameraArray
-from capture.documents import key_problems, read_json
+from capture.documents import is_whole, key_problems, read_json, write_json
 from capture.errors import CameraError, LikenessError, raise_all
 from capture.names import is_plain_name
 from capture.pose import Pose
-from capture.product import replacing
 
 _REQUIRED = ("name", "width", "height", "K", "dist", "R", "t")
 _OPTIONAL = ("gain",)  # a device's relative gain: a remark that no stage needs
@@ -104,8 +102,7 @@ def write_cameras(
     }
     if report is not None:
         document["report"] = dict(report)
-    with replacing(path) as partial:
-        partial.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+    write_json(path, document)
 
 
 def _camera(entry: Any, index: int) -> Camera:
@@ -122,7 +119,7 @@ def _camera(entry: Any, index: int) -> Camera:
     if k[0, 1] != 0 or k[1, 0] != 0 or not np.array_equal(k[2], [0, 0, 1]):
         raise CameraError(f"{label}: K must be [[fx,0,cx],[0,fy,cy],[0,0,1]], found {k.tolist()}")
     for key in ("width", "height"):
-        if not isinstance(entry[key], int) or isinstance(entry[key], bool):
+        if not is_whole(entry[key]):
             raise CameraError(f"{label}: {key} must be a whole number of px, found {entry[key]!r}")
     try:
         pose = Pose(_numbers(entry, "R", (3, 3), label), _numbers(entry, "t", (3,), label))

@@ -29,7 +29,7 @@ from dataclasses import dataclass, field, replace
 from statistics import median
 
 from capture.clock_model import ClockModel, fit_model
-from capture.devices.protocol import DeviceInfo
+from capture.devices.protocol import ClockKind, DeviceInfo
 from capture.errors import SettingsError
 from capture.frame import FrameEvent
 from capture.ledger import Ledger, LedgerEntry, Oddity, Remark, Verdict
@@ -43,6 +43,9 @@ _LAGS = 16  # frames, of which the soonest tells how late frames are when nothin
 # clock has likely missed triggers with it. Nothing arrives before it was exposed.
 _COST_MISSED, _COST_LATE, _COST_CLOCK, _COST_NUMBER, _COST_EARLY = 1.0, 1.5, 2.0, 2.0, 10.0
 _IMPOSSIBLE = _COST_EARLY
+_UNFOLLOWED = 3e-4  # how far clocks may part while a device is silent
+_NEXT_NUMBERS = 16  # as far ahead, a frame that comes early is no old one
+_PACED = 512  # frames after which a device's own pace is better known than the train's
 
 
 @dataclass(frozen=True)
@@ -93,6 +96,8 @@ class _Track:
     clock: DeviceClock
     last: FrameEvent | None = None
     last_index: int = -1
+    began: tuple[int, int] | None = None  # trigger and time of the first frame since a jump
+    slip_ns: int = 0  # the train's at the latest frame
     lags_ns: deque[int] = field(default_factory=lambda: deque(maxlen=_REMEMBERED))
     first_lag_ns: int | None = None  # the shortest of the first lags
     seen: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=_REMEMBERED))
@@ -152,7 +157,9 @@ class Collator:
         )
         if index is None:
             return None
-        track.last, track.last_index = event, index
+        track.last, track.last_index, track.slip_ns = event, index, self.slip_ns
+        if track.began is None:
+            track.began = index, event.t_dev_ns
         track.lags_ns.append(event.t_host_ns - self.train.time_ns(index))
         if track.first_lag_ns is None and len(track.lags_ns) == _LAGS:
             track.first_lag_ns = min(track.lags_ns)
@@ -164,7 +171,7 @@ class Collator:
     def restart(self, device: str, clock: DeviceClock) -> None:
         """Take a device up anew that was lost and found again: its next frame is a first one."""
         track = self._tracks[device]
-        track.clock, track.last = clock, None
+        track.clock, track.last, track.began = clock, None, None
         track.lags_ns.clear()
         track.seen.clear()
         track.segments.append([])
@@ -251,7 +258,7 @@ class Collator:
 
     def _first(self, track: _Track, event: FrameEvent) -> int:
         period = self.train.period_ns
-        start = self.train.start_ns + track.clock.phase_ns
+        start = self.train.start_ns + self.slip_ns + track.clock.phase_ns
         phase = (track.clock.model.to_host(event.t_dev_ns) - start) / period
         newest = (event.t_host_ns - start) // period
         lowest = track.last_index + 1
@@ -264,7 +271,7 @@ class Collator:
 
     def _next(self, track: _Track, last: FrameEvent, event: FrameEvent) -> int | None:
         ids = _id_step(last.frame_id, event.frame_id, track.info)
-        step = (event.t_dev_ns - last.t_dev_ns) / self.train.period_ns
+        step = (event.t_dev_ns - last.t_dev_ns) / self._pace_ns(track, last)
         near = abs(step - round(step)) <= _NEAR
         again = (event.frame_id, event.t_dev_ns) in track.seen or (near and round(step) == ids < 0)
         if ids == 0 or again:
@@ -282,28 +289,46 @@ class Collator:
         if index is None:
             self._remark(track, Oddity.STALE, event, track.last_index)
             return None
-        if index != by_time:
+        # The host's own clock does not step by parts of a period: its driver was late.
+        if index != by_time and not (agreed and track.info.clock == ClockKind.HOST):
             self._remark(track, Oddity.CLOCK_STEP, event, index)
             track.segments.append([])
+            track.began = None
         if by_id is None or by_id > index:
             self._remark(track, Oddity.ID_RESET, event, index)
         self._explain_gap(track, index, by_id)
         return index
 
+    def _pace_ns(self, track: _Track, last: FrameEvent) -> float:
+        """From trigger to trigger by the device's clock, as it was since its clock last jumped.
+
+        The generator and the device's clock are each off by some millionths, and a device may be
+        silent for an hour.
+        """
+        period = self.train.period_ns
+        if track.began is None or track.last_index - track.began[0] < _PACED:
+            return period
+        pace = (last.t_dev_ns - track.began[1]) / (track.last_index - track.began[0])
+        return pace if abs(pace - period) < 0.002 * period else period
+
     def _weigh(
         self, track: _Track, event: FrameEvent, by_time: int | None, by_id: int | None
     ) -> int | None:
         """The likeliest index of a frame whose number and time disagree; None when none is."""
-        period = self.train.period_ns
-        usual, soonest = median(track.lags_ns), min(track.lags_ns)
+        period, slipped = self.train.period_ns, self.slip_ns - track.slip_ns
+        usual, soonest = median(track.lags_ns) + slipped, min(track.lags_ns) + slipped
         by_arrival = round((event.t_host_ns - self.train.start_ns - usual) / period)
         best, least = None, _IMPOSSIBLE
+        if by_id is not None and by_id - track.last_index <= _NEXT_NUMBERS:
+            # One of the next numbers is a new frame: the host may have been late until now.
+            by_arrival, least = max(by_arrival, track.last_index + 1), float("inf")
         for index in (by_time, by_id, by_arrival):
             if index is None or index <= track.last_index:
                 continue
             lag = event.t_host_ns - self.train.time_ns(index)
+            most = 0.5 + _UNFOLLOWED * (index - track.last_index)
             # A busy host is late by turns: early is what comes sooner than any frame before.
-            early, late = (soonest - lag) / period > 0.5, (lag - usual) / period > 0.5
+            early, late = (soonest - lag) / period > most, (lag - usual) / period > most
             cost = _COST_EARLY if early else _COST_LATE if late else 0.0
             cost += 0.0 if index == by_time else _COST_CLOCK
             if by_id is None or by_id > index:

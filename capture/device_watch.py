@@ -81,7 +81,7 @@ class DeviceWatch:
         if time.monotonic() < self._due_s:
             return
         self._due_s = time.monotonic() + _LOOK_EVERY_S
-        clocks = {name: said.ptp for name, said in self._health.items() if said.ptp is not None}
+        clocks = {name: said.ptp for name, said in self.health().items() if said.ptp is not None}
         self._ptp.append((time.monotonic(), clocks))
         for device in self._stream.array.devices:
             name = device.info.name
@@ -156,6 +156,8 @@ class DeviceWatch:
             age_s = max(stream.pumped_ns - count.heard_ns, 0) / 1e9
         colour, sentence = _judged(age_s, period_s, taken, reserved)
         reached = count.last_index + 1
+        if count.trouble:
+            sentence = f"{sentence}: {count.trouble}" if sentence else count.trouble
         if colour == Colour.RED:
             reached = 1 + max(other.last_index for other in stream.counts.values())
         not_ok = max(reached - count.complete, 0)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import tomllib
 from collections.abc import Callable, Mapping
+from enum import StrEnum
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 from capture.durable import sync_folder
 from capture.errors import InputError, WorkError
@@ -32,6 +34,39 @@ def read_json(path: Path, kind: type[InputError] = InputError, *, absent: str = 
     return _read(path, json.loads, "JSON", kind, absent)
 
 
+def read_document(
+    path: Path, form: str, version: int, kind: type[InputError] = InputError
+) -> dict[str, Any]:
+    """The parsed JSON of a document of ours, which names its format and version.
+
+    Args:
+        path: the file.
+        form: what its "format" must say.
+        version: the newest that is read; all older ones are.
+        kind: the class of error to raise.
+
+    Raises:
+        InputError: (as `kind`) naming the file, when it is not such a document, or a newer one.
+    """
+    document = read_json(path, kind)
+    if not isinstance(document, dict) or document.get("format") != form:
+        raise kind(f'{path}: expected "format": "{form}"')
+    found = document.get("version")
+    if not is_whole(found) or found < 1:
+        raise kind(f"{path}: version must be a whole number, found {found!r}")
+    if found > version:
+        raise kind(
+            f"{path}: written in format version {found}, this program reads up to {version}; "
+            "update likeness"
+        )
+    return document
+
+
+def is_whole(value: object) -> TypeGuard[int]:
+    """Whether a parsed value is a whole number, as JSON means it: true and false are none."""
+    return isinstance(value, int) and not isinstance(value, bool)
+
+
 def read_toml(path: Path, kind: type[InputError] = InputError, *, absent: str = "") -> Any:
     """The parsed TOML of a file; arguments and errors as of `read_json`."""
     return _read(path, tomllib.loads, "TOML", kind, absent)
@@ -53,6 +88,17 @@ def key_problems(
         if key not in known:
             problems.append(f"{what}: unknown key {key!r}; {known_hint(key, known)}")
     return problems
+
+
+def plain_json(value: Any) -> Any:
+    """The value as reading its JSON back gives it, with null for NaN and infinity."""
+    if isinstance(value, Mapping):
+        return {key: plain_json(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain_json(inner) for inner in value]
+    if isinstance(value, StrEnum):
+        return value.value
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def write_json(path: Path, document: Mapping[str, Any]) -> None:

@@ -37,11 +37,17 @@ class AppendFile:
         Args:
             path: the file.
             label: what messages call it, where that is not its path.
+
+        Raises:
+            WorkError: when the disk is full or fails.
         """
         self.path = Path(path)
         self._label = label or str(path)
         self.offset = 0
-        self._file: BinaryIO = self.path.open("wb", buffering=0)
+        try:
+            self._file: BinaryIO = self.path.open("wb", buffering=0)
+        except OSError as error:
+            raise WorkError(self._said(error)) from error
         self._sync_error: OSError | None = None
         self._syncing = threading.Lock()
 
@@ -180,7 +186,11 @@ class FolderLock:
 
 
 def sync_folder(folder: Path) -> None:
-    """Bring the names in a folder to the disk: a new file is lost without it, whatever it holds."""
+    """Bring the names in a folder to the disk: a new file is lost without it, whatever it holds.
+
+    Raises:
+        WorkError: when the disk fails.
+    """
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(handle)

@@ -8,13 +8,14 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 
 from capture.devices.capabilities import FeatureDump
+from capture.documents import write_json
 from capture.errors import WorkError
 from capture.names import is_plain_name
+from capture.product import replacing
 
 _FORMAT = "likeness-features"
 _VERSION = 1
@@ -41,10 +42,10 @@ def write_features(folder: Path, dumps: Mapping[str, FeatureDump]) -> None:
                 "values": dict(dump.values),
                 "unread": dict(dump.unread),
             }
-            text = json.dumps(document, indent=1) + "\n"
-            (folder / "features" / f"{name}.json").write_text(text, encoding="utf-8")
+            write_json(folder / "features" / f"{name}.json", document)
             if dump.description and is_plain_name(dump.description_sha256):
                 path = folder / "features" / f"{dump.description_sha256}.xml"
-                path.write_text(dump.description, encoding="utf-8")
+                with replacing(path) as partial:
+                    partial.write_text(dump.description, encoding="utf-8")
     except OSError as error:
         raise WorkError(f"{folder}: features cannot be written: {error.strerror}") from error

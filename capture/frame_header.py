@@ -67,7 +67,11 @@ class ImageLayout:
 
     @classmethod
     def of(cls, image: Image) -> ImageLayout:
-        """The layout of an (H, W) or (H, W, 3) uint8 or uint16 image."""
+        """The layout of an (H, W) or (H, W, 3) uint8 or uint16 image.
+
+        Raises:
+            TakeError: when it is another array.
+        """
         if image.ndim not in (2, 3):
             raise TakeError(f"an image must be (H, W) or (H, W, 3), found shape {image.shape}")
         channels = 1 if image.ndim == 2 else int(image.shape[2])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import StrEnum
 from itertools import pairwise
@@ -29,8 +30,15 @@ class Colour(StrEnum):
     AMBER = "amber"
     RED = "red"
 
+    @property
+    def badness(self) -> int:
+        """0 green, 1 amber, 2 red: what colours are sorted and compared by."""
+        return list(Colour).index(self)
 
-_ORDER = (Colour.GREEN, Colour.AMBER, Colour.RED)
+
+def worst_colour(colours: Iterable[Colour]) -> Colour:
+    """The worst of some colours; green when there is none."""
+    return max(colours, key=lambda colour: colour.badness, default=Colour.GREEN)
 
 
 @dataclass(frozen=True)
@@ -49,7 +57,7 @@ class Judgement:
 
     def at_best(self, colour: Colour, sentence: str) -> Judgement:
         """No better than a colour; the sentence is added where that makes it worse."""
-        if _ORDER.index(colour) <= _ORDER.index(self.colour):
+        if colour.badness <= self.colour.badness:
             return self
         return Judgement(colour, f"{self.sentence} {sentence}", self.spread_ns)
 
@@ -64,6 +72,9 @@ def judge(ledger: Ledger, hold: tuple[int, int] | None = None) -> Judgement:
     Args:
         ledger: of the take.
         hold: first and last frame of the part that must be whole, or None.
+
+    Raises:
+        SettingsError: when the hold lies outside the take.
     """
     if hold is not None and not 0 <= hold[0] <= hold[1] < ledger.triggers:
         raise SettingsError(f"hold must lie within frames 0..{ledger.triggers - 1}, found {hold}")
@@ -112,7 +123,9 @@ def _causes(broken: dict[int, list[LedgerEntry]]) -> str:
     named = []
     for entry in lines[:_NAMED]:
         if entry.verdict == Verdict.LOST:
-            named.append(f"frame {entry.trigger_index} of {entry.device} was lost in transport")
+            # Where the frame got stuck tells the operator where to look: at the disk, or a cable.
+            how = "could not be written" if entry.unwritten else "was lost in transport"
+            named.append(f"frame {entry.trigger_index} of {entry.device} {how}")
         else:
             named.append(f"{entry.device} {_WORDS[entry.verdict]} frame {entry.trigger_index}")
     rest = f" and {len(lines) - _NAMED} more" if len(lines) > _NAMED else ""

@@ -8,19 +8,23 @@ that nobody knows of.
 
 from __future__ import annotations
 
+import logging
 import os
 import queue
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
+from types import TracebackType
 
 from capture.arrays import Image
 from capture.crc import crc32
-from capture.errors import DeviceError, WorkError
+from capture.errors import LikenessError
 from capture.window import HeldFrame
 
 Write = Callable[[HeldFrame, Image, int], None]
 Failed = Callable[[HeldFrame, str], None]
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -36,6 +40,10 @@ class LaneJob:
     frame: HeldFrame
     write: Write
     failed: Failed
+
+    def fail(self, why: str) -> None:
+        """Tell that the frame could not be fetched or written."""
+        self.failed(self.frame, why)
 
 
 class WriteLanes:
@@ -86,21 +94,43 @@ class _Lane:
 
     def _check(self) -> None:
         while (job := self._fresh.get()) is not None:
-            try:
+            with _Attempt(job.fail):
                 pixels = job.frame.device.frames.pixels(job.frame.event)
                 self._ready.put((job, pixels, crc32(pixels.reshape(-1).view("u1"))))
-            except DeviceError as error:
-                job.failed(job.frame, str(error))
-                job.frame.done()
+                continue
+            self._give_back(job)
         self._ready.put(None)
 
     def _write(self) -> None:
         while (ready := self._ready.get()) is not None:
             job, pixels, crc = ready
             del ready
-            try:
+            with _Attempt(job.fail):
                 job.write(job.frame, pixels, crc)
-            except WorkError as error:
-                job.failed(job.frame, str(error))
-            finally:
-                job.frame.done()
+            self._give_back(job)
+
+    def _give_back(self, job: LaneJob) -> None:
+        name = job.frame.event.device
+        with _Attempt(lambda why: _log.warning("%s: memory is not given back: %s", name, why)):
+            job.frame.done()
+
+
+class _Attempt:
+    """What goes wrong with a frame ends that frame, and not the lane: others wait for it."""
+
+    def __init__(self, told: Callable[[str], None]) -> None:
+        self._told = told
+
+    def __enter__(self) -> None:
+        return None
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> bool:
+        if error is not None:
+            # A third party's device may raise anything: its kind is told as well.
+            self._told(str(error) if isinstance(error, LikenessError) else repr(error))
+        return isinstance(error, Exception)

@@ -21,6 +21,7 @@ _COLUMNS = (
     "t_ns",
     "note",
 )
+_NOT_WRITTEN = "not written: "
 
 
 class Verdict(StrEnum):
@@ -66,6 +67,11 @@ class LedgerEntry:
     t_host_ns: int = -1
     t_ns: int = -1
     note: str = ""
+
+    @property
+    def unwritten(self) -> bool:
+        """Whether a frame came and could not be written; see `unwritten`."""
+        return self.verdict == Verdict.LOST and self.note.startswith(_NOT_WRITTEN)
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,7 +157,7 @@ def unwritten(ledger: Ledger, reasons: Mapping[tuple[int, str], str]) -> Ledger:
         reasons: by trigger index and device.
     """
     entries = tuple(
-        replace(entry, verdict=Verdict.LOST, note=f"not written: {reasons[pair]}")
+        replace(entry, verdict=Verdict.LOST, note=f"{_NOT_WRITTEN}{reasons[pair]}")
         if (pair := (entry.trigger_index, entry.device)) in reasons
         else entry
         for entry in ledger.entries

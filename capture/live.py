@@ -6,9 +6,11 @@ devices, lanes write, and each take has one that sees it through to its end.
 
 from __future__ import annotations
 
+import sys
 import threading
 import time
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 
@@ -74,8 +76,9 @@ class LiveArray:
         Raises:
             DeviceError: listing every device that could not be prepared or stays silent.
         """
-        if self._lanes is not None:
+        if self.running:
             return
+        self.stop()  # what is left when it ended by itself
         self._stream, self.trouble = self._fresh_stream(), ""
         self._watch, self._lanes = DeviceWatch(self._stream), WriteLanes()
         self._running.set()
@@ -105,11 +108,13 @@ class LiveArray:
         for thread in self._threads:
             thread.join()
         self._watch.close()
-        self._stream.stop()
-        self._lanes.close()
-        for thread in self._takes:
-            thread.join()
-        self._threads, self._takes, self._lanes = [], [], None
+        try:
+            self._stream.stop()
+        finally:
+            for thread in self._takes:  # before the lanes: a take's files may still be being made
+                thread.join()
+            self._lanes.close()
+            self._threads, self._takes, self._lanes = [], [], None
 
     def record(self, session: Session, shot: Shot) -> LiveTake:
         """Open the window of a take now; returns at once.
@@ -170,11 +175,12 @@ class LiveArray:
     def latest(self) -> dict[str, Image]:
         """A copy of the latest complete image of each device that has one."""
         images = {}
-        for name, frame in self._stream.latest().items():
-            try:
+        with ExitStack() as held:
+            latest = self._stream.latest()
+            for frame in latest.values():
+                held.callback(frame.done)
+            for name, frame in latest.items():
                 images[name] = frame.device.frames.pixels(frame.event).copy()
-            finally:
-                frame.done()
         return images
 
     def reconnect(self, name: str) -> None:
@@ -212,8 +218,11 @@ class LiveArray:
                 loop()
         except (LikenessError, OSError) as error:
             self.trouble = str(error)
-            self._running.clear()
-            self._stream.stop()
+        finally:
+            if self._running.is_set():  # an error that nobody foresaw goes on from here
+                self.trouble = self.trouble or f"the program is at fault: {sys.exception()!r}"
+                self._running.clear()
+                self._stream.stop()
 
     def _pump(self) -> None:
         self._stream.pump()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -13,9 +14,10 @@ from typing import Any
 
 from capture.arrays import Image
 from capture.device_watch import DeviceWatch
-from capture.errors import DeviceError, LikenessError
+from capture.devices.capabilities import FeatureDump
+from capture.errors import DeviceError, LikenessError, WorkError
 from capture.feature_files import write_features
-from capture.judgement import Judgement
+from capture.judgement import Colour, Judgement
 from capture.lanes import LaneJob, WriteLanes
 from capture.ledger import Verdict, unwritten
 from capture.recorder import Recording, RecordSettings
@@ -87,6 +89,8 @@ class LiveTake:
         self._written = 0
         self._checked = 0.0
         self._gone: dict[tuple[int, str], str] = {}  # frames that could not be written, and why
+        self._noted: Mapping[str, FeatureDump] = {}
+        self._unnoted = ""
         self._ended = threading.Event()
 
     @property
@@ -143,6 +147,7 @@ class LiveTake:
         try:
             self._watch = watch
             with make() as writer:
+                self._note_features(writer, watch)  # before frames fill the disk
                 self._write_to(writer)
                 self._save(writer, self._drained(), watch)
                 self.phase = TakePhase.CHECKING
@@ -154,9 +159,11 @@ class LiveTake:
             self.phase = TakePhase.DONE
         except (LikenessError, OSError) as error:
             self.error = str(error)
-            self._give_up()
-            self.phase = TakePhase.FAILED
         finally:
+            if self.phase != TakePhase.DONE:  # an error that nobody foresaw goes on from here
+                self.error = self.error or f"the program is at fault: {sys.exception()!r}"
+                self._give_up()
+                self.phase = TakePhase.FAILED
             self._ended.set()
 
     def _deliver(self, frame: HeldFrame) -> None:
@@ -206,13 +213,18 @@ class LiveTake:
         if self._window is None:
             raise DeviceError(f"{self.name}: never begun")
         self._window.closed.wait()
-        recording = self._window.recording
-        if recording is None:
-            raise DeviceError(f"{self.name}: the array was stopped before its first frame")
-        self._judge(recording)
-        self.phase = TakePhase.DRAINING
-        with self._change:
-            self._change.wait_for(lambda: self._written + len(self._gone) >= len(self._delivered))
+        try:
+            recording = self._window.recording
+            if recording is None:
+                raise DeviceError(f"{self.name}: the array was stopped before its first frame")
+            self._judge(recording)
+            self.phase = TakePhase.DRAINING
+        finally:
+            # Whatever happens: no lane may still write into files that are closed after this.
+            with self._change:
+                self._change.wait_for(
+                    lambda: self._written + len(self._gone) >= len(self._delivered)
+                )
         return self._judge(recording)
 
     def _judge(self, collated: Recording) -> Recording:
@@ -237,7 +249,9 @@ class LiveTake:
     def _save(self, writer: TakeWriter, recording: Recording, watch: DeviceWatch) -> None:
         verdict = self.judgement or judge_take(recording, self.shot, self._settings)
         health = watch.health()
-        write_features(writer.folder, watch.features())
+        self._note_features(writer, watch)  # of devices that were found again, or answered late
+        if self._unnoted:
+            verdict = self.judgement = verdict.at_best(Colour.AMBER, f"{self._unnoted}.")
         writer.finish(
             lambda devices: manifest_of(
                 self._opening, self.name, devices, recording, verdict, health
@@ -245,6 +259,15 @@ class LiveTake:
             ledger=recording.ledger,
             hashed=False,
         )
+
+    def _note_features(self, writer: TakeWriter, watch: DeviceWatch) -> None:
+        """Write down what devices are set to; a take is not lost when a full disk has no room."""
+        known, self._noted = self._noted, watch.features()
+        fresh = {name: dump for name, dump in self._noted.items() if known.get(name) is not dump}
+        try:
+            write_features(writer.folder, fresh)
+        except WorkError as error:
+            self._unnoted = str(error)
 
     def _read_back(self, done: int, total: int, what: str) -> None:
         self._checked = done / max(total, 1)

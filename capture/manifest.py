@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from capture.documents import read_json
+from capture.documents import is_whole, read_document, write_json
 from capture.errors import LikenessError, TakeError, raise_all
 from capture.frame_header import ImageLayout
 from capture.names import is_plain_name
-from capture.product import replacing
 
 FORMAT = "likeness-take"
 VERSION = 1
@@ -89,19 +87,7 @@ def read_manifest(path: Path) -> TakeManifest:
     Raises:
         TakeError: naming the file, when it is damaged or was written by a newer version.
     """
-    document = read_json(path, TakeError)
-    if not isinstance(document, dict) or document.get("format") != FORMAT:
-        raise TakeError(f'{path}: damaged manifest: expected "format": "{FORMAT}"')
-    version = document.get("version")
-    if not isinstance(version, int) or version < 1:
-        raise TakeError(
-            f"{path}: damaged manifest: version must be a whole number, found {version!r}"
-        )
-    if version > VERSION:
-        raise TakeError(
-            f"{path}: written in format version {version}, this program reads up to {VERSION}; "
-            "update likeness"
-        )
+    document = read_document(path, FORMAT, VERSION, TakeError)
     try:
         return _manifest(document)
     except KeyError as error:
@@ -111,7 +97,11 @@ def read_manifest(path: Path) -> TakeManifest:
 
 
 def write_manifest(path: Path, manifest: TakeManifest) -> None:
-    """Write take.json, whole or not at all."""
+    """Write take.json, whole or not at all, and wait until the disk holds it.
+
+    Raises:
+        WorkError: naming the file, when the disk does not take it; the old file stays.
+    """
     document = {
         "format": FORMAT,
         "version": VERSION,
@@ -134,8 +124,7 @@ def write_manifest(path: Path, manifest: TakeManifest) -> None:
         ],
         "remarks": dict(manifest.remarks),
     }
-    with replacing(path) as partial:
-        partial.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+    write_json(path, document)
 
 
 def _manifest(document: Mapping[str, Any]) -> TakeManifest:
@@ -166,6 +155,6 @@ def _device(entry: Mapping[str, Any]) -> DeviceEntry:
 
 def _whole(entry: Mapping[str, Any], key: str) -> int:
     value = entry[key]
-    if not isinstance(value, int) or isinstance(value, bool):
+    if not is_whole(value):
         raise TakeError(f"{key} must be a whole number, found {value!r}")
     return value

@@ -302,7 +302,7 @@ class FrameReader:
         while (found := self._record_at(file, offset)) is not None:
             opcode, length = found
             body = offset + RECORD.size
-            if opcode == Op.CHANNEL:
+            if opcode == Op.CHANNEL and length <= records.LARGEST_CHANNEL:
                 metadata = records.parse_channel(_read_at(file, body, length), self.path)
                 try:
                     layout = ImageLayout(
@@ -327,6 +327,9 @@ class FrameReader:
             return None
         start, _, crc = FOOTER.unpack_from(footer, RECORD.size)
         if not 0 < start <= self._size - tail:
+            return None
+        longest = records.longest_summary(start, frame_bytes(self.layout))
+        if self._size - tail - start > longest:
             return None
         summary = _read_at(file, start, self._size - tail - start)
         if crc32(summary + footer[: RECORD.size + 16]) != crc:

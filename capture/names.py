@@ -1,8 +1,10 @@
-"""Names: which are safe as file names (devices, slates, takes), and which a wrong one meant."""
+"""Names: which are safe as file names (devices, slates, takes), which a wrong one meant, and how
+something is named once in a message."""
 
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterable
 
 _LONGEST = 64
@@ -23,3 +25,13 @@ def known_hint(name: object, known: Iterable[str]) -> str:
     names = list(known)
     near = difflib.get_close_matches(str(name), names, n=1)
     return f"did you mean {near[0]!r}?" if near else f"known: {', '.join(names)}"
+
+
+def named(name: str, words: object) -> str:
+    """What is said of something, with its name before it and nowhere else as such a mark."""
+    return f"{name}: {unnamed(name, words)}"
+
+
+def unnamed(name: str, words: object) -> str:
+    """What is said of something whose name already stands elsewhere in the message."""
+    return re.sub(rf"(?:^|(?<=[\s(])){re.escape(name)}: ", "", str(words))

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from capture.documents import read_json, write_json
+from capture.documents import is_whole, read_document, write_json
 from capture.errors import LikenessError, TakeError, raise_all
 from capture.frame_header import ImageLayout
 from capture.names import is_plain_name
@@ -73,15 +73,7 @@ def read_opening(path: Path) -> Opening:
     Raises:
         TakeError: naming the file, when it is missing, damaged or of a newer version.
     """
-    document = read_json(path, TakeError)
-    if not isinstance(document, dict) or document.get("format") != _FORMAT:
-        raise TakeError(f'{path}: expected "format": "{_FORMAT}"')
-    version = document.get("version")
-    if not isinstance(version, int) or version > _VERSION:
-        raise TakeError(
-            f"{path}: written in format version {version!r}, this program reads up to {_VERSION}; "
-            "update likeness"
-        )
+    document = read_document(path, _FORMAT, _VERSION, TakeError)
     try:
         expected = document["expected_frames"]
         return Opening(
@@ -102,6 +94,6 @@ def _layout(entry: Mapping[str, Any]) -> ImageLayout:
 
 
 def _whole(value: object, key: str) -> int:
-    if not isinstance(value, int) or isinstance(value, bool):
+    if not is_whole(value):
         raise TakeError(f"{key} must be a whole number, found {value!r}")
     return value

@@ -12,7 +12,6 @@ and the others are superseded.
 from __future__ import annotations
 
 import dataclasses
-import json
 import re
 import shutil
 from collections.abc import Mapping, Sequence
@@ -23,12 +22,12 @@ from typing import Any
 from capture.collate import TriggerTrain
 from capture.devices.array import DeviceArray
 from capture.devices.capabilities import Health
-from capture.documents import read_json
+from capture.documents import read_document, write_json
+from capture.durable import FolderLock
 from capture.errors import SettingsError, TakeError, raise_all
 from capture.judgement import Colour, Judgement, judge
 from capture.manifest import DeviceEntry, TakeManifest
 from capture.names import is_plain_name
-from capture.product import replacing
 from capture.progress import Progress, silent
 from capture.recorder import Recording, RecordSettings
 from capture.stream import record_frames
@@ -140,8 +139,7 @@ class Session:
         session = cls(folder, name if name is not None else folder.name)
         (folder / "takes").mkdir(parents=True, exist_ok=True)
         document = {"format": FORMAT, "version": VERSION, "name": session.name}
-        with replacing(folder / "session.json") as partial:
-            partial.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+        write_json(folder / "session.json", document)
         return session
 
     @classmethod
@@ -154,19 +152,15 @@ class Session:
         path = Path(folder) / "session.json"
         if not path.is_file():
             raise TakeError(f"{folder}: expected a session, found no session.json")
-        document = read_json(path, TakeError)
-        if not isinstance(document, dict) or document.get("format") != FORMAT:
-            raise TakeError(f'{path}: expected "format": "{FORMAT}"')
-        version = document.get("version")
-        if not isinstance(version, int) or version > VERSION:
-            raise TakeError(
-                f"{path}: written in format version {version!r}, this program reads up to "
-                f"{VERSION}; update likeness"
-            )
+        document = read_document(path, FORMAT, VERSION, TakeError)
         return cls(Path(folder), str(document.get("name", Path(folder).name)))
 
-    def takes(self) -> tuple[TakeNote, ...]:
+    def takes(self, damaged: list[str] | None = None) -> tuple[TakeNote, ...]:
         """All takes, slates in order of name and takes in order of number.
+
+        Args:
+            damaged: what is wrong with a take that cannot be read is added here, and the take left
+                out; None: it is raised.
 
         Raises:
             TakeError: naming a take whose manifest does not say what was recorded.
@@ -175,9 +169,17 @@ class Session:
         for folder in sorted((self.folder / "takes").glob("*/take.json")):
             if folder.parent.name.startswith(".") or folder.parent.suffix == ".partial":
                 continue  # not finished, or left behind by a recording that was killed
-            remarks = dict(Take.open(folder.parent).manifest.remarks)
-            if "shot" in remarks and "take_number" in remarks:
-                _check_remarks(folder, remarks)
+            try:
+                remarks = dict(Take.open(folder.parent).manifest.remarks)
+                recorded = "shot" in remarks and "take_number" in remarks
+                if recorded:
+                    _check_remarks(folder, remarks)
+            except TakeError as error:
+                if damaged is None:
+                    raise
+                damaged.append(str(error))
+                continue
+            if recorded:
                 found.append(
                     (remarks["shot"]["slate"], remarks["take_number"], folder.parent, remarks)
                 )
@@ -230,10 +232,11 @@ def _check_remarks(path: Path, remarks: dict[str, Any]) -> None:
         and all(isinstance(remarks[table].get(key), str) for key in keys)
         for table, keys in wanted.items()
     )
-    if not good:
+    good = good and remarks["judgement"]["colour"] in tuple(Colour)
+    if not good or not is_plain_name(remarks["shot"]["slate"]):
         raise TakeError(
             f"{path}: damaged manifest: remarks must hold a take_number, shot (slate, kind) and "
-            "judgement (colour, sentence)"
+            "judgement (colour green, amber or red, and sentence)"
         )
 
 
@@ -267,8 +270,9 @@ def record_take(
     total = count * len(layouts)
     label = f"record {folder.name}"
     partial = partial_folder(folder)
+    writer = TakeWriter(partial, layouts)
     try:
-        with TakeWriter(partial, layouts) as writer:
+        with FolderLock(partial), writer:
             recording = record_frames(
                 array,
                 settings,
@@ -284,8 +288,8 @@ def record_take(
                 ledger=recording.ledger,
                 hashed=False,
             )
-        take = Take.open(partial)
-        return settle(take, verify_take(take))
+            take = Take.open(partial)
+            return settle(take, verify_take(take))
     except BaseException:
         shutil.rmtree(partial, ignore_errors=True)
         raise

@@ -11,16 +11,16 @@ does so in threads of their own (`capture.live`).
 from __future__ import annotations
 
 import threading
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 
 from capture.arrays import Image
 from capture.collate import Collator, TriggerTrain
 from capture.devices.array import DeviceArray
 from capture.devices.capabilities import Latching
-from capture.devices.protocol import ClockSample
+from capture.devices.protocol import ClockSample, Device
 from capture.errors import DeviceError
 from capture.frame import FrameEvent
 from capture.frame_header import FrameHeader
@@ -31,6 +31,7 @@ from capture.window import Deliver, HeldFrame, Window
 Sink = Callable[[str, FrameHeader, Image], None]
 
 _LOOK_S = 1.0  # how long triggers that others send are looked for before silent devices are left
+_LOOK_FRAMES = 4  # of each device that are asked for meanwhile: the first one is often late
 _FORGET_EVERY = 256
 _FOLLOW_NS = 500_000_000
 
@@ -44,12 +45,14 @@ class DeviceCount:
         complete: of them, placed and complete.
         last_index: trigger of the latest; -1 before any.
         heard_ns: when the latest arrived, by the host's clock; -1 before any.
+        trouble: why it could not be asked for frames; empty again when the next one comes.
     """
 
     received: int = 0
     complete: int = 0
     last_index: int = -1
     heard_ns: int = -1
+    trouble: str = ""
 
 
 class Stream:
@@ -83,6 +86,7 @@ class Stream:
         self._windows: list[Window] = []
         self._fired = -1
         self._forgotten = 0
+        self._stopped = False
         self._started_ns = self._follow_ns = 0
         self._lock = threading.RLock()
 
@@ -138,16 +142,15 @@ class Stream:
             self._begin(TriggerTrain(begin, period), {})
 
     def stop(self) -> None:
-        """Stop every device and give all held frames back; windows that are open are closed."""
-        with self._lock:
+        """Stop every device and give all held frames back; windows that are open are closed with
+        the triggers that have been sent so far, and none can be opened any more.
+        """
+        with self._lock, ExitStack() as steps:  # all of them, whatever a device raises
+            self._stopped = True
+            self.end_windows()
+            steps.callback(self._let_go)
             for device in self.array.devices:
-                with suppress(DeviceError):  # one that is gone cannot be stopped, nor need it be
-                    device.acquire.stop()
-            for window in list(self._windows):
-                self._close(window)
-            for ring in self._rings:
-                while ring:
-                    ring.popleft().done()
+                steps.callback(_stop, device)
 
     def fire(self) -> None:
         """Send the next trigger, waiting until it is due."""
@@ -163,7 +166,7 @@ class Stream:
         with self._lock:
             # Before polling: what arrives while this is slow has not been looked for yet.
             now = self.array.line.now_ns()
-            arrived = [event for device in self.array.devices for event in device.frames.poll()]
+            arrived = [event for device in self.array.devices for event in self._poll(device)]
             if self._collator is None:
                 self._early += arrived
                 arrived = self._look()
@@ -186,8 +189,13 @@ class Stream:
             count: how many triggers.
             deliver: given each of its complete frames, in a device's order of arrival; whoever gets
                 one calls its `done`.
+
+        Raises:
+            DeviceError: when the array was stopped.
         """
         with self._lock:
+            if self._stopped:
+                raise DeviceError("the array does not stream any more")
             window = Window(first, count, deliver)
             self._windows.append(window)
             held = [h for ring in self._rings for h in ring if first <= h.trigger_index]
@@ -242,16 +250,24 @@ class Stream:
         # All views of one instant together: a scene that keeps its last instant computes it once.
         return frame.trigger_index, self._places[frame.event.device]
 
+    def _poll(self, device: Device) -> Sequence[FrameEvent]:
+        try:
+            return device.frames.poll()
+        except DeviceError as error:  # the others go on
+            self.counts[device.info.name].trouble = str(error)
+            return ()
+
     def _deliver(self, collator: Collator, events: list[FrameEvent]) -> None:
         placed = []
         for event in events:
             place = self._places[event.device]
             count, device = self.counts[event.device], self.array.devices[place]
             count.received += 1
-            count.heard_ns = event.t_host_ns
+            count.heard_ns, count.trouble = event.t_host_ns, ""
             if event.device in self._anew:
                 self._anew.remove(event.device)
-                collator.restart(event.device, self._clocks.anew(event, collator.train))
+                clock = self._clocks.anew(event, collator.train_from(0))
+                collator.restart(event.device, clock)
             index = collator.add(event)
             count.last_index = collator.last_index(event.device)
             if index is None or not (event.complete or self.settings.keep_incomplete):
@@ -282,9 +298,10 @@ class Stream:
 
     def _look(self) -> list[FrameEvent]:
         """Make out triggers that others send; the frames so far once that is done."""
-        heard = {event.device for event in self._early}
+        heard = Counter(event.device for event in self._early)
+        few = len(heard) < len(self.counts) or min(heard.values()) < _LOOK_FRAMES
         waited = self.array.line.now_ns() - self._started_ns
-        if not heard or (len(heard) < len(self.counts) and waited < 1e9 * _LOOK_S):
+        if not heard or (few and waited < 1e9 * _LOOK_S):
             return []
         early, self._early = self._early, []
         self._begin(*self._clocks.make_out(early))
@@ -298,15 +315,15 @@ class Stream:
         self._windows.remove(window)
         if self._collator is not None:
             edge = self.settings.edge_triggers
-            first = max(window.first - edge, 0)
-            count = window.first - first + window.count + edge
+            first, triggers = max(window.first - edge, 0), window.count
+            count = window.first - first + triggers + edge
             part, readings = self._collator.cut(first, count), self._clocks.readings()
             basis = self._clocks.basis
 
             def make() -> Recording:
                 return Recording(
                     part.train_from(window.first),
-                    part.ledger(window.first, window.count),
+                    part.ledger(window.first, triggers),
                     part.clocks(first, count),
                     basis,
                     readings,
@@ -316,14 +333,27 @@ class Stream:
         else:
             window.close(None)
 
+    def _let_go(self) -> None:
+        for window in list(self._windows):
+            self._close(window)
+        for ring in self._rings:
+            while ring:
+                ring.popleft().done()
+
     def _forget(self, collator: Collator) -> None:
         newest = max(count.last_index for count in self.counts.values())
         oldest = min([window.first for window in self._windows], default=newest)
-        held = min((ring[0].trigger_index for ring in self._rings if ring), default=newest)
-        before = min(oldest, held, newest - _FORGET_EVERY) - self.settings.edge_triggers
+        # The ring of a device that died holds its last frames for ever: no window asks for those.
+        before = min(oldest, newest - max(self._ring_frames, _FORGET_EVERY))
+        before -= self.settings.edge_triggers
         if before >= self._forgotten + _FORGET_EVERY:
             collator.forget(before)
             self._forgotten = before
+
+
+def _stop(device: Device) -> None:
+    with suppress(DeviceError):  # one that is gone cannot be stopped, nor need it be
+        device.acquire.stop()
 
 
 def record_frames(

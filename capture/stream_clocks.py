@@ -64,6 +64,7 @@ class StreamClocks:
             The train, and by device how much later than it the device exposed, ns.
         """
         first: dict[str, int] = {}
+        period = self._settings.period_ns
         for name in sorted({event.device for event in events}):
             own = [event for event in events if event.device == name]
             if self._kinds[name] == ClockKind.HOST:
@@ -74,8 +75,9 @@ class StreamClocks:
                     [event.t_dev_ns for event in own],
                     [event.t_host_ns - late_ns for event in own],
                 )
-            first[name] = self._models[name].to_host(own[0].t_dev_ns)
-        period = self._settings.period_ns
+            times = [self._models[name].to_host(event.t_dev_ns) for event in own]
+            away = median(_wrapped(t_ns - times[0], period) for t_ns in times)
+            first[name] = times[0] + round(away)  # one that was late decides nothing
         origin = min(first.values())
         phases = {name: _wrapped(t_ns - origin, period) for name, t_ns in first.items()}
         middle = round(median(phases.values()))

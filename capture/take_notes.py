@@ -18,7 +18,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
-from capture.documents import key_problems, read_json, write_json
+from capture.documents import is_whole, key_problems, read_document, write_json
 from capture.errors import TakeError, raise_all
 from capture.judgement import Colour
 from capture.names import is_plain_name
@@ -126,15 +126,7 @@ class NoteBook:
 
 
 def _read_note(path: Path) -> OperatorNote:
-    document = read_json(path, TakeError)
-    if not isinstance(document, dict) or document.get("format") != FORMAT:
-        raise TakeError(f'{path}: expected "format": "{FORMAT}"')
-    version = document.get("version")
-    if not isinstance(version, int) or version > VERSION:
-        raise TakeError(
-            f"{path}: written in format version {version!r}, this program reads up to "
-            f"{VERSION}; update likeness"
-        )
+    document = read_document(path, FORMAT, VERSION, TakeError)
     raise_all(str(path), key_problems(document, _KEYS, _KEYS, "note"), TakeError)
     try:
         overruled = document["overruled"]
@@ -164,6 +156,6 @@ def _text(table: Mapping[str, Any], key: str) -> str:
 
 
 def _stars(value: Any) -> int:
-    if not isinstance(value, int) or isinstance(value, bool):
+    if not is_whole(value):
         raise TakeError(f"rating: expected a whole number, found {value!r}")
     return value

@@ -157,6 +157,7 @@ class TakeWriter:
         try:
             if ledger is not None:
                 write_ledger(self.folder / "ledger.csv", ledger)
+            sync_tree(self.folder)  # a manifest on the disk says that all else is there
             write_manifest(self.folder / MANIFEST, manifest)
         except OSError as error:
             raise WorkError(f"{self.folder}: cannot be finished: {error.strerror}") from error

@@ -14,6 +14,7 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
+from pathlib import Path
 
 from capture.checksums import fixed_files, read_checksums, write_checksums
 from capture.crc import Crc32Joiner
@@ -350,15 +351,27 @@ def _check_sums(take: Take, hashes: Mapping[str, str], problems: list[str]) -> N
     for name, sha256 in expected.items():
         path = take.folder / name
         try:
-            found = hashes.get(name) or hash_file(path)
-        except OSError as error:
-            problems.append(f"{path}: not readable: {error.strerror}")
+            found = hashes.get(name) or _hash_inside(take.folder, path)
+        except TakeError as error:
+            problems.append(str(error))
             continue
         if found != sha256:
             problems.append(f"{path}: its SHA-256 is not the one in manifest-sha256.txt")
     for name in fixed_files(take.folder):
         if name not in expected:
             problems.append(f"{take.folder / name}: is not in manifest-sha256.txt")
+
+
+def _hash_inside(folder: Path, path: Path) -> str:
+    """The hash of a file of the take: of nothing that a link leads to, and of no device or pipe."""
+    if not path.is_file():
+        raise TakeError(f"{path}: stands in manifest-sha256.txt, and there is no such file")
+    if not path.resolve().is_relative_to(folder.resolve()):
+        raise TakeError(f"{path}: a link leads out of the take to {path.resolve()}")
+    try:
+        return hash_file(path)
+    except OSError as error:
+        raise TakeError(f"{path}: not readable: {error.strerror}") from error
 
 
 def _check_device(reader: FrameReader, device: str, ledger: Ledger, problems: list[str]) -> None:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import importlib
 import json
-import math
 import os
 import re
 import sys
@@ -17,6 +16,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from capture.documents import plain_json
 from capture.errors import InputError, LikenessError
 from capture.names import known_hint
 from capture.product import code_version
@@ -122,7 +122,7 @@ def _run(verb: str, rest: list[str]) -> int:
         return 2 if isinstance(error, _MISPLACED) else 1
     bar.close()
     if options.json:
-        print(json.dumps(_plain(report), default=str, allow_nan=False))
+        print(json.dumps(plain_json(report), default=str, allow_nan=False))
     else:
         for key, value in report.items():
             print(f"{key}: {value}", file=sys.stderr)
@@ -142,15 +142,6 @@ def _stdout_for_the_report() -> Iterator[None]:
         sys.stdout = written
         os.dup2(kept, 1)
         os.close(kept)
-
-
-def _plain(value: Any) -> Any:
-    """The value with null for what JSON has no word for: NaN and infinity."""
-    if isinstance(value, dict):
-        return {key: _plain(inner) for key, inner in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(inner) for inner in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _missing_package(name: str) -> str:
@@ -177,6 +168,7 @@ def _parse(verb: str, module: ModuleType, rest: list[str]) -> Any:
 
     config = _config_path(rest)
     prog = f"likeness {verb}"
+    told = (module.__doc__ or "").replace("\nExample:", "\n\nExample:")  # a paragraph of its own
     settings: dict[str, Any] = {}
     if config is not None:
         stages = {
@@ -185,12 +177,12 @@ def _parse(verb: str, module: ModuleType, rest: list[str]) -> Any:
         }
         settings = read_settings(config, stages)
     if verb not in settings:
-        return tyro.cli(module.Arguments, args=rest, prog=prog, description=module.__doc__)
+        return tyro.cli(module.Arguments, args=rest, prog=prog, description=told)
     return tyro.cli(
         module.Arguments,
         args=rest,
         prog=prog,
-        description=module.__doc__,
+        description=told,
         default=module.Arguments(
             **dict.fromkeys(module.REQUIRED, tyro.MISSING), settings=settings[verb]
         ),

@@ -10,8 +10,8 @@ from pathlib import Path
 
 from capture.camera import CameraArray
 from capture.devices.simulated import simulated_array
+from capture.documents import write_json
 from capture.errors import InputError
-from capture.product import replacing
 from capture.progress import Progress, silent
 from capture.recorder import RecordSettings
 from capture.session import Session, Shot, record_take
@@ -121,5 +121,4 @@ def _keep_settings(path: Path, settings: DemoSettings) -> None:
                 "choose another --out, or remove that folder"
             )
         return
-    with replacing(path) as partial:
-        partial.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+    write_json(path, document)

@@ -3,6 +3,7 @@
 # missing. System libraries come by apt where we may install; otherwise one line names the command.
 set -eu
 cd "$(dirname "$0")/.."
+. tools/apt.sh
 
 PACKAGES=""
 need_library() {  # need_library SONAME DEBIAN_PACKAGE
@@ -37,22 +38,7 @@ if [ ! -x .venv/bin/python ]; then
 fi
 
 if [ -n "$PACKAGES" ]; then
-    command -v apt-get >/dev/null 2>&1 || {
-        echo "setup: missing system libraries; install with your package manager:$PACKAGES" >&2
-        exit 1
-    }
-    if [ "$(id -u)" -eq 0 ]; then
-        AS_ROOT=""
-    elif command -v sudo >/dev/null 2>&1 && sudo -n true 2>/dev/null; then
-        AS_ROOT="sudo -n"
-    else
-        echo "setup: run this once, then try again: sudo apt-get install -y$PACKAGES" >&2
-        exit 1
-    fi
-    echo "setup: installing system packages:$PACKAGES" >&2
-    $AS_ROOT apt-get update -qq
-    # shellcheck disable=SC2086
-    DEBIAN_FRONTEND=noninteractive $AS_ROOT apt-get install -y -qq --no-install-recommends $PACKAGES >/dev/null
+    install_packages setup "$PACKAGES"
     PYTHON="$(find_python)"
 fi
 [ -n "$PYTHON" ] || [ -x .venv/bin/python ] || {

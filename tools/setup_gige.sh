@@ -3,6 +3,7 @@
 # starts in a second when nothing is missing. Where we may not install, one line names the command.
 set -eu
 cd "$(dirname "$0")/.."
+. tools/apt.sh
 
 PACKAGES=""
 need() {  # need DEBIAN_PACKAGE COMMAND...: the package is missing when the command fails
@@ -36,22 +37,7 @@ open(os.path.join(sysconfig.get_path('include'), 'Python.h')).close()
 fi
 
 if [ -n "$PACKAGES" ]; then
-    command -v apt-get >/dev/null 2>&1 || {
-        echo "setup-gige: missing packages; install with your package manager:$PACKAGES" >&2
-        exit 1
-    }
-    if [ "$(id -u)" -eq 0 ]; then
-        AS_ROOT=""
-    elif command -v sudo >/dev/null 2>&1 && sudo -n true 2>/dev/null; then
-        AS_ROOT="sudo -n"
-    else
-        echo "setup-gige: run this once, then try again: sudo apt-get install -y$PACKAGES" >&2
-        exit 1
-    fi
-    echo "setup-gige: installing system packages:$PACKAGES" >&2
-    $AS_ROOT apt-get update -qq
-    # shellcheck disable=SC2086
-    DEBIAN_FRONTEND=noninteractive $AS_ROOT apt-get install -y -qq --no-install-recommends $PACKAGES >/dev/null
+    install_packages setup-gige "$PACKAGES"
 fi
 
 if ! gobject >/dev/null 2>&1; then

@@ -9,7 +9,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -18,7 +17,7 @@ from pathlib import Path
 
 from capture.calibration_link.reference import read_reference
 from capture.camera_file import read_cameras
-from capture.documents import key_problems, read_json
+from capture.documents import key_problems, read_document, write_json
 from capture.errors import TakeError, raise_all
 from capture.judgement import Colour
 from capture.product import hash_file, replacing
@@ -115,8 +114,7 @@ def link_calibration(
         with replacing(folder / "reference.npz") as partial:
             shutil.copyfile(kept, partial)
     document = {"format": _FORMAT, "version": _VERSION, **asdict(link)}
-    with replacing(session / LINK_FILE) as partial:
-        partial.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+    write_json(session / LINK_FILE, document)
     return link
 
 
@@ -129,15 +127,7 @@ def read_link(session: Path) -> CalibrationLink | None:
     path = Path(session) / LINK_FILE
     if not path.is_file():
         return None
-    document = read_json(path, TakeError)
-    if not isinstance(document, dict) or document.get("format") != _FORMAT:
-        raise TakeError(f'{path}: expected "format": "{_FORMAT}"')
-    version = document.get("version")
-    if not isinstance(version, int) or version > _VERSION:
-        raise TakeError(
-            f"{path}: written in format version {version!r}, this program reads up to {_VERSION}; "
-            "update likeness"
-        )
+    document = read_document(path, _FORMAT, _VERSION, TakeError)
     words = ("id", "sha256", "source", "made", "linked")
     known = (*words, "devices", "has_reference")
     problems = key_problems(document, known, ("format", "version", *known), "calibration link")
@@ -193,7 +183,8 @@ def calibration_standing(
         return LinkStanding(
             Colour.AMBER,
             "The session names no calibration: its takes can be recorded, not reconstructed yet.",
-            "Name the calibration of this array, or record a board take and calibrate.",
+            'Write calibration = "cameras.json" into the array file; without one, record a board '
+            "take and run: likeness calibrate",
         )
     copy = linked_cameras(session)
     if not copy.is_file() or hash_file(copy) != link.sha256:

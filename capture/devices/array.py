@@ -13,7 +13,7 @@ from capture.devices.protocol import (
     TriggerSpec,
 )
 from capture.errors import DeviceError, TakeError, raise_all
-from capture.names import is_plain_name
+from capture.names import is_plain_name, named
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +78,7 @@ class DeviceArray:
             try:
                 work(device)
             except DeviceError as error:
-                problems.append(f"  - {device.info.name}: {error}")
+                problems.append(f"  - {named(device.info.name, error)}")
         if problems:
             raise DeviceError(
                 "\n".join([f"{len(problems)} of {len(self.devices)} devices {failed}:", *problems])

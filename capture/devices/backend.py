@@ -26,7 +26,7 @@ class FoundDevice:
         address: by which the backend opens it: an IP address or device id, a path.
         serial: by which it is known again, wherever it is plugged in.
         model: maker and model.
-        transport: "gige", "usb3", "v4l2", "simulated" or "replay".
+        transport: "gige", "usb3", "v4l2", "simulated" or "replay"; a third party's own word.
         link_mbps: what its link carries, Mbit/s; None unknown.
         problems: why it may not work, in words: another subnet, in use by another program.
     """

@@ -106,6 +106,15 @@ class Monitored(Protocol):
 
 
 @runtime_checkable
+class Cautioned(Protocol):
+    """A device that knows of itself why it may lose frames, or was changed when it was opened."""
+
+    @property
+    def problems(self) -> tuple[str, ...]:
+        """Each in words, a remedy behind "; " where there is one; told by the preflight."""
+
+
+@runtime_checkable
 class PtpClocked(Protocol):
     """A device whose clock can follow IEEE 1588."""
 

@@ -11,6 +11,7 @@ from capture.documents import read_toml
 from capture.errors import DeviceError, SettingsError, raise_all
 
 _CLOSE = 1e-3  # relative: a device rounds an exposure or a gain to its own steps
+_SLIGHT = 1e-2  # relative: coarse steps of its own; told, and no reason not to record
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,11 @@ class Difference:
     asked: FeatureValue
     found: FeatureValue | None
     why: str = ""
+
+    @property
+    def slight(self) -> bool:
+        """Whether the device took the value and rounded it to coarse steps of its own."""
+        return self.found is not None and not self.why and alike(self.asked, self.found, _SLIGHT)
 
     def __str__(self) -> str:
         found = "nothing" if self.found is None else repr(self.found)
@@ -83,7 +89,7 @@ def compare_preset(
             found: FeatureValue | None = device.read_feature(name)
         except DeviceError as error:
             found, said[name] = None, said.get(name) or str(error)
-        if found is None or not _same(asked, found):
+        if found is None or not alike(asked, found):
             differences.append(Difference(name, asked, found, said.get(name, "")))
     return tuple(differences)
 
@@ -124,8 +130,10 @@ def preset_from_table(document: Mapping[str, object], where: str, name: str) -> 
     return Preset(name, tuple(writes))
 
 
-def _same(asked: FeatureValue, found: FeatureValue) -> bool:
-    numbers = isinstance(asked, int | float) and isinstance(found, int | float)
-    if numbers and not isinstance(asked, bool) and not isinstance(found, bool):
-        return abs(float(asked) - float(found)) <= _CLOSE * max(abs(float(asked)), 1e-9)
+def alike(asked: FeatureValue, found: FeatureValue, share: float = _CLOSE) -> bool:
+    """Whether two values are the same setting: numbers up to a share of the first."""
+    if isinstance(asked, bool) or isinstance(found, bool):
+        return asked is found
+    if isinstance(asked, int | float) and isinstance(found, int | float):
+        return abs(asked - found) <= share * max(abs(asked), 1e-9)
     return asked == found

@@ -97,7 +97,7 @@ class DeviceInfo:
         triggers: what can start its exposures.
         first_id: the number that follows the highest: 1 with GigE Vision, 0 with V4L2.
         clock: whose clock dates its frames.
-        transport: "gige", "usb3", "v4l2", "simulated" or "replay".
+        transport: "gige", "usb3", "v4l2", "simulated" or "replay"; a third party's own word.
         address: by which its backend opens it.
         link_mbps: what its link carries, Mbit/s; None when that is not known.
     """

@@ -5,14 +5,15 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 
-from capture.devices.capabilities import Featured, FeatureValue
-from capture.devices.preset import Preset, compare_preset
+from capture.devices.capabilities import Cautioned, Featured, FeatureValue
+from capture.devices.preset import Preset, alike, compare_preset
 from capture.devices.protocol import Device
 from capture.devices.roster import Finding as RosterFinding
 from capture.devices.roster import FindingKind
 from capture.disk import DiskForecast
 from capture.errors import DeviceError
 from capture.judgement import Colour, judge
+from capture.names import unnamed
 from capture.preflight.finding import Finding, steps
 from capture.recorder import Recording
 from capture.sync_report import sync_report
@@ -22,6 +23,7 @@ _ALIKE = (
     "TriggerActivation", "ExposureAuto", "GainAuto",
 )  # fmt: skip
 _SHOWN = 3
+_ROUNDED = 0.01  # devices of one model may round a setting differently
 
 
 def roster_findings(roster: Sequence[RosterFinding]) -> list[Finding]:
@@ -64,12 +66,18 @@ def preset_findings(devices: Sequence[Device], presets: Mapping[str, Preset]) ->
         if differences:
             shown = "; ".join(str(one) for one in differences[:_SHOWN])
             more = f"; and {len(differences) - _SHOWN} more" if len(differences) > _SHOWN else ""
-            words = f"{name} is not set as preset {presets[name].name} says: {shown}{more}."
+            said = unnamed(name, f"{shown}{more}")
+            slight = all(one.slight for one in differences)
+            does = "rounds preset {}" if slight else "is not set as preset {} says"
+            words = f"{name} {does.format(presets[name].name)}: {said}."
             remedy = steps(
                 ("Stop the array and open it again: presets are then written anew.",
                  "If a value is refused, put what the device offers into the preset.")
             )  # fmt: skip
-            found.append(Finding("preset", name, Colour.RED, words, remedy))
+            if slight:
+                remedy = "Put what it reads into the preset, so that the file says what is there."
+            colour = Colour.AMBER if slight else Colour.RED
+            found.append(Finding("preset", name, colour, words, remedy))
     if compared and not found:
         words = f"{compared} devices are set as their presets say."
         found.append(Finding("preset", "", Colour.GREEN, words))
@@ -90,16 +98,36 @@ def odd_settings(devices: Sequence[Device]) -> list[Finding]:
             values.setdefault((device.info.model, feature), {})[device.info.name] = value
     found = []
     for (_, feature), by_name in values.items():
-        counted = Counter(by_name.values()).most_common()
-        usual, votes = counted[0]
-        if len(counted) < 2 or 2 * votes <= len(by_name):
+        usual, votes = _usual(list(by_name.values()))
+        if 2 * votes <= len(by_name):
             continue
         for name, value in by_name.items():
-            if value != usual:
+            if not alike(usual, value, _ROUNDED):
                 words = f"{name} has {feature} = {value!r}, the others of its model have {usual!r}."
                 remedy = "Write the feature into the preset of every device, and apply it."
                 found.append(Finding("preset", name, Colour.AMBER, words, remedy))
     return found
+
+
+def cautions(devices: Sequence[Device]) -> list[Finding]:
+    """What devices say of themselves that may lose frames."""
+    told = [
+        (device.info.name, problem.partition("; "))
+        for device in devices
+        if isinstance(device, Cautioned)
+        for problem in device.problems
+    ]
+    return [
+        Finding("device", name, Colour.AMBER, f"{name} says: {what}.", remedy)
+        for name, (what, _, remedy) in told
+    ]
+
+
+def _usual(values: Sequence[FeatureValue]) -> tuple[FeatureValue, int]:
+    """The value that most have, up to rounding, and how many."""
+    votes = {one: sum(alike(one, other, _ROUNDED) for other in values) for one in set(values)}
+    usual = max(values, key=votes.__getitem__)
+    return usual, votes[usual]
 
 
 def burst_findings(burst: Recording) -> list[Finding]:

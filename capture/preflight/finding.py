@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from capture.judgement import Colour
-
-_ORDER = (Colour.RED, Colour.AMBER, Colour.GREEN)
+from capture.judgement import Colour, worst_colour
 
 
 @dataclass(frozen=True)
@@ -15,8 +13,8 @@ class Finding:
     """What one check says of one device, or of the array.
 
     Attributes:
-        check: which: "link", "memory", "disk", "network", "roster", "preset", "ptp", "sync",
-            "exposure", "focus", "scene", "calibration" or "flash".
+        check: which: "link", "memory", "disk", "device", "network", "roster", "preset", "ptp",
+            "sync", "exposure", "focus", "scene", "calibration" or "flash".
         device: its name; empty when it is the array or the host.
         colour: green: well. Amber: recording may begin. Red: it may not.
         sentence: what was found, in plain words.
@@ -32,13 +30,12 @@ class Finding:
 
 def worst(findings: Iterable[Finding]) -> Colour:
     """The worst colour; green when there is no finding."""
-    colours = {finding.colour for finding in findings}
-    return next((colour for colour in _ORDER if colour in colours), Colour.GREEN)
+    return worst_colour(finding.colour for finding in findings)
 
 
 def ordered(findings: Iterable[Finding]) -> tuple[Finding, ...]:
     """Red first, green last; in their own order within a colour."""
-    return tuple(sorted(findings, key=lambda finding: _ORDER.index(finding.colour)))
+    return tuple(sorted(findings, key=lambda finding: -finding.colour.badness))
 
 
 def steps(remedies: Sequence[str]) -> str:

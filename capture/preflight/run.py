@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from capture.calibration_link.link import calibration_standing, linked_reference
+from capture.calibration_link.link import calibration_standing, linked_cameras, linked_reference
 from capture.calibration_link.reference import DeviceReference, read_reference
 from capture.devices.capabilities import PtpClocked
 from capture.devices.preset import Preset
 from capture.devices.protocol import TriggerKind
 from capture.devices.roster import Finding as RosterFinding
 from capture.disk import DiskForecast
-from capture.documents import read_json
+from capture.documents import read_json, write_json
 from capture.errors import LikenessError, TakeError
 from capture.judgement import Colour
 from capture.live import LiveArray
 from capture.preflight.array_checks import (
     burst_findings,
+    cautions,
     disk_findings,
     odd_settings,
     preset_findings,
@@ -44,7 +44,6 @@ from capture.preflight.look import (
     scene_findings,
 )
 from capture.preflight.ptp import PtpGate, ptp_findings
-from capture.product import replacing
 from capture.progress import Progress, silent
 from capture.settings import check_ranges
 
@@ -108,7 +107,7 @@ def preflight(
     Args:
         subject: what is checked; its array must be streaming.
         settings: how.
-        progress: told after each check.
+        progress: told before each check and at the end; what it raises ends the preflight.
 
     Returns:
         Findings, red first; every check that could be made says something.
@@ -117,14 +116,15 @@ def preflight(
     sights: dict[str, Sight] = {}
     checks = _checks(subject, settings, sights, progress)
     found: list[Finding] = []
-    for done, (name, check) in enumerate(checks, start=1):
+    for done, (name, check) in enumerate(checks):
+        progress(done, len(checks), f"preflight: {name}")
         try:
             found += check()
         except (LikenessError, OSError) as error:
             words = f"The check of {name} could not be made: {error}"
             remedy = "See to that, then run the preflight again."
             found.append(Finding(name, "", Colour.RED, words, remedy))
-        progress(done, len(checks), f"preflight: {name}")
+    progress(len(checks), len(checks), "preflight")
     return ordered(found)
 
 
@@ -177,6 +177,7 @@ def _checks(
         ("link", lambda: timing_findings(devices, rate, record.exposure_us)),
         ("memory", memory),
         ("disk", lambda: [] if subject.disk is None else disk_findings(subject.disk())),
+        ("device", lambda: cautions(devices)),
         ("network", lambda: network_findings(devices, rate)),
         ("preset", presets),
         ("calibration", lambda: _calibration(subject, settings)),
@@ -203,8 +204,7 @@ def session_exposure(subject: Subject, sights: Mapping[str, Sight]) -> list[Find
     found = exposure_findings(sights)
     if sights and worst(found) != Colour.RED:
         levels = {name: round(sight.mean, 5) for name, sight in sights.items()}
-        with replacing(path) as partial:
-            partial.write_text(json.dumps(levels, indent=1) + "\n", encoding="utf-8")
+        write_json(path, levels)
     return found
 
 
@@ -225,9 +225,12 @@ def _calibration(subject: Subject, settings: PreflightSettings) -> list[Finding]
         subject.session, subject.live.array.names, old_days=settings.calibration_days
     )
     found = [Finding("calibration", "", standing.colour, standing.sentence, standing.remedy)]
-    if not linked_reference(subject.session).is_file():
+    named = linked_cameras(subject.session).is_file()
+    if named and not linked_reference(subject.session).is_file():
         words = "No pictures of calibration day are kept: focus and motion are not compared."
-        remedy = "Make the reference when the array is calibrated, and link it to the session."
+        remedy = (
+            "Record somebody who sits still and run: likeness reference TAKE --cameras CAMERAS.json"
+        )
         found.append(Finding("scene", "", Colour.AMBER, words, remedy))
     return found
 

@@ -166,6 +166,8 @@ class _Search:
         start, _, crc = FOOTER.unpack_from(footer, RECORD.size)
         if not 0 < start < self._size - tail:
             return self._size
+        if self._size - tail - start > records.longest_summary(start, self._chunk_bytes):
+            return self._size
         summary = self._read(start, self._size - tail - start)
         sound = crc32(summary + footer[: RECORD.size + FOOTER.size - 4]) == crc
         self._summary_sound = sound and footer.endswith(MAGIC)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
+from capture.documents import is_whole
 from capture.durable import FolderLock
 from capture.errors import LikenessError, TakeError
 from capture.frame_header import ImageLayout
@@ -92,13 +93,17 @@ def recover_take(folder: Path, *, progress: Progress = silent) -> TakeRecovery:
         try:
             return _recover(folder, progress)
         except LikenessError as error:
-            return TakeRecovery(folder=folder, outcome=Outcome.FAILED, reason=str(error))
+            reason = str(error)
+        except OSError as error:
+            reason = f"{error.filename or folder}: {error.strerror or error}"
+        return TakeRecovery(folder=folder, outcome=Outcome.FAILED, reason=reason)
 
 
 def _recover(folder: Path, progress: Progress) -> TakeRecovery:
     final = folder.with_suffix("")
     if final.exists():
         raise TakeError(f"{final}: exists already; move it away, and run this again")
+    _refuse_links(folder)
     (folder / ROOM).unlink(missing_ok=True)
     known = _known(folder)
     frames = folder / "frames"
@@ -135,6 +140,16 @@ def _recover(folder: Path, progress: Progress) -> TakeRecovery:
         verdicts=ledger.counts(),
         remade=tuple(remade),
     )
+
+
+def _refuse_links(folder: Path) -> None:
+    """Recovery cuts and moves files: it does so to none that stands elsewhere."""
+    links = [path for path in folder.rglob("*") if path.is_symlink()]
+    if folder.is_symlink() or links:
+        raise TakeError(
+            f"{links[0] if links else folder}: is a link, and a recording makes none; put the "
+            "file itself there, and run this again"
+        )
 
 
 def _known(folder: Path) -> _Known:
@@ -237,4 +252,4 @@ def _new_manifest(
 
 def _whole(table: Any, key: str) -> int | None:
     value = table.get(key) if isinstance(table, dict) else None
-    return value if isinstance(value, int) and not isinstance(value, bool) else None
+    return value if is_whole(value) else None

@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from types import TracebackType
 
 from capture.device_watch import DeviceState
@@ -17,6 +17,7 @@ from capture.errors import LikenessError, WorkError
 from capture.judgement import Colour
 from capture.live_take import TakePhase
 from capture.preflight.finding import Finding
+from capture.progress import Progress
 from capture.recorder import RecordSettings
 from capture.rom.contract import StreamingArray
 from capture.rom.disk_watch import DiskWatch
@@ -58,7 +59,8 @@ class Stand:
         array: streams the devices; started and stopped by the conductor, not entered or left.
         settings: of the recording.
         frame_set_bytes: of the frames of all devices at one trigger.
-        preflight: checks the streaming array; called in a thread of its own.
+        preflight: checks the streaming array; called in a thread of its own, with whom to tell how
+            far it is.
         keep_green: whether a green take that was read back whole is kept without a key.
         reserve_bytes: of the disk, what must stay free.
     """
@@ -68,7 +70,7 @@ class Stand:
     array: StreamingArray
     settings: RecordSettings
     frame_set_bytes: int
-    preflight: Callable[[], Sequence[Finding]] = tuple
+    preflight: Callable[[Progress], Sequence[Finding]] = lambda _: ()
     keep_green: bool = True
     reserve_bytes: int = 1 << 30
 
@@ -132,6 +134,7 @@ class Conductor:
         """Close the take that is being recorded, wait for all, stop the array."""
         try:
             self._takes.stop(self._state.current)
+            self._state = replace(self._state, closing=True)
             problem = self._preparation.close()
             if problem:
                 self._say(Colour.RED, problem)
@@ -241,6 +244,7 @@ class Conductor:
                 fractions=self._takes.fractions(),
                 devices=self._devices,
                 disk=self._disk.forecast,
+                checking=self._preparation.at,
                 findings=self._preparation.findings,
                 messages=tuple(self._messages),
             )

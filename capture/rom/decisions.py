@@ -49,13 +49,14 @@ def judged_anew(take: TakeState, *, keep_green: bool = False) -> TakeState:
 
     Args:
         take: with its news.
-        keep_green: whether it is kept without a key when it is green and read back whole.
+        keep_green: whether it is kept without a key when it is green, read back whole and was not
+            closed before its end.
     """
     news = take.overruled is None or bool(take.problems)
     if take.shown_colour == Colour.RED and news and take.status == TakeStatus.KEEP:
         return _decided(take, TakeStatus.UNDECIDED, "")
     whole = take.phase == TakePhase.DONE and take.shown_colour == Colour.GREEN
-    if keep_green and whole and take.status == TakeStatus.UNDECIDED:
+    if keep_green and whole and not take.cut and take.status == TakeStatus.UNDECIDED:
         return _decided(take, TakeStatus.KEEP, MACHINE)
     return take
 

@@ -284,13 +284,17 @@ class Machine:
 
     def _judged(self, state: RomState, take: TakeState, event: TakeJudged) -> Step:
         judged = replace(
-            take, phase=TakePhase.DRAINING, colour=event.colour, sentence=event.sentence
-        )
+            take, phase=TakePhase.DRAINING, colour=event.colour, sentence=event.sentence,
+            cut=state.closing,
+        )  # fmt: skip
         after = replace(
             state.with_take(judged), stage=Stage.DRAIN, since_s=event.at_s, closing=False,
             advance=event.colour != Colour.RED and not state.closing,
         )  # fmt: skip
-        return Step(after, told=((event.colour, f"{take.name}: {event.sentence}"),))
+        told = [(event.colour, f"{take.name}: {event.sentence}")]
+        if judged.cut and event.colour != Colour.RED:
+            told.append((Colour.AMBER, f"{take.name} was closed early: keep it, or go again."))
+        return Step(after, told=tuple(told))
 
     def _written(self, state: RomState, take: TakeState, event: TakeWritten) -> Step:
         written = judged_anew(

@@ -13,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from capture.documents import read_json, write_json
+from capture.documents import read_document, write_json
 from capture.errors import TakeError
 from capture.judgement import Colour
 from capture.live_take import TakePhase
@@ -80,7 +80,7 @@ def load_state(session: Session, prompts: PromptList) -> tuple[RomState, tuple[s
     told: list[str] = []
     state = RomState()
     if path.exists():
-        document = _read(path)
+        document = read_document(path, FORMAT, VERSION, TakeError)
         try:
             state = _state_of(document, prompts, told)
         except (KeyError, TypeError, ValueError) as error:
@@ -89,6 +89,7 @@ def load_state(session: Session, prompts: PromptList) -> tuple[RomState, tuple[s
                 "with the takes on disk"
             ) from error
     state = _with_takes_on_disk(session, state, told)
+    told += [f"{take.name}: {_CUT_SHORT}" for take in state.takes if take.problems == (_CUT_SHORT,)]
     state = _with_remains(session, state, told)
     notes = NoteBook.of_session(session.folder).all()
     takes = tuple(_with_note(take, notes.get(take.name)) for take in state.takes)
@@ -97,19 +98,6 @@ def load_state(session: Session, prompts: PromptList) -> tuple[RomState, tuple[s
 
 def _path(session: Session) -> Path:
     return session.folder / "rom.json"
-
-
-def _read(path: Path) -> Mapping[str, Any]:
-    document = read_json(path, TakeError)
-    if not isinstance(document, dict) or document.get("format") != FORMAT:
-        raise TakeError(f'{path}: expected "format": "{FORMAT}"')
-    version = document.get("version")
-    if not isinstance(version, int) or version > VERSION:
-        raise TakeError(
-            f"{path}: written in format version {version!r}, this program reads up to "
-            f"{VERSION}; update likeness"
-        )
-    return document
 
 
 def _state_of(document: Mapping[str, Any], prompts: PromptList, told: list[str]) -> RomState:
@@ -141,7 +129,8 @@ def _take_of(table: Mapping[str, Any]) -> TakeState:
 
 
 def _with_takes_on_disk(session: Session, state: RomState, told: list[str]) -> RomState:
-    for found in session.takes():
+    damaged: list[str] = []
+    for found in session.takes(damaged):
         name = found.folder.name
         known = state.take(name)
         if known is not None and known.problems != (_CUT_SHORT,):
@@ -158,6 +147,7 @@ def _with_takes_on_disk(session: Session, state: RomState, told: list[str]) -> R
             )
         )
         told.append(f"{name} stands on the disk and is taken up; decide about it.")
+    told += [f"A take cannot be read: {problem}" for problem in damaged]
     return state
 
 

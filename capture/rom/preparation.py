@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
-from capture.errors import LikenessError
+from capture.errors import LikenessError, WorkError
 from capture.judgement import Colour
 from capture.preflight.finding import Finding, ordered, worst
+from capture.progress import Progress
 from capture.rom.contract import StreamingArray
 
 
@@ -40,29 +42,35 @@ class Prepared:
 class Preparation:
     """One thread for what takes a while; its jobs are done one after the other."""
 
-    def __init__(self, array: StreamingArray, preflight: Callable[[], Sequence[Finding]]) -> None:
+    def __init__(
+        self, array: StreamingArray, preflight: Callable[[Progress], Sequence[Finding]]
+    ) -> None:
         """Hold an array; nothing is started yet.
 
         Args:
             array: to start and stop.
-            preflight: checks it while it streams.
+            preflight: checks it while it streams; told to end early by what its progress raises.
         """
         self._array, self._preflight = array, preflight
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="likeness-preparation")
         self._check: Future[Prepared] | None = None
         self._stops: list[Future[None]] = []
         self._searches: list[tuple[str, Future[None]]] = []
+        self._unwanted = threading.Event()  # the check that runs; each has its own
         self.streaming = False
+        self.at = ""
         self.findings: tuple[Finding, ...] = ()
 
     def start(self) -> None:
         """Start the array, unless it streams already, and check it."""
-        self.findings = ()
-        self._check = self._worker.submit(self._start_and_check)
+        self.findings, self.at = (), ""
+        self._unwanted = threading.Event()
+        self._check = self._worker.submit(self._start_and_check, self._unwanted)
 
     def stop(self) -> None:
-        """Stop the array; a check that is not finished is forgotten."""
+        """Stop the array; a check that is not finished is ended and forgotten."""
         self._check = None
+        self._unwanted.set()
         self._stops.append(self._worker.submit(self._stop))
 
     def close(self) -> str:
@@ -95,7 +103,12 @@ class Preparation:
         self._searches = [one for one in self._searches if one not in done]
         return tuple((device, str(_refused(job) or "")) for device, job in done)
 
-    def _start_and_check(self) -> Prepared:
+    def _start_and_check(self, unwanted: threading.Event) -> Prepared:
+        def heard(done: int, total: int, what: str) -> None:
+            if unwanted.is_set():
+                raise WorkError("the check was ended")
+            self.at = f"{what.removeprefix('preflight: ')} ({done} of {total})"
+
         try:
             if self.streaming and self._array.trouble:
                 self._stop()
@@ -105,7 +118,7 @@ class Preparation:
         except LikenessError as error:
             return Prepared((_refusal(error, "Put that right and arm again."),), streaming=False)
         try:
-            found = ordered(self._preflight())
+            found = ordered(self._preflight(heard))
         except LikenessError as error:
             return Prepared((_refusal(error, "Check again."),), streaming=True)
         return Prepared(found, streaming=True)

@@ -33,6 +33,7 @@ class Sight:
         fractions: of takes under way, by name.
         devices: how each fares.
         disk: how long it lasts.
+        checking: what the preflight looks at now; empty before the first.
         findings: of the last preflight.
         messages: so far.
     """
@@ -45,6 +46,7 @@ class Sight:
     fractions: Mapping[str, float]
     devices: tuple[DeviceState, ...]
     disk: DiskForecast | None
+    checking: str
     findings: tuple[Finding, ...]
     messages: tuple[Message, ...]
 
@@ -144,7 +146,8 @@ def _headline(sight: Sight, prompt: Prompt) -> str:
         case Stage.IDLE:
             return "The devices are stopped. Arm them to begin."
         case Stage.PREFLIGHT if state.preflight is None:
-            return "The devices are being started and checked."
+            at = f": {sight.checking}" if sight.checking else ""
+            return f"The devices are being started and checked{at}."
         case Stage.PREFLIGHT:
             return "The check was red. Put it right and check again, or overrule it with a reason."
         case Stage.COUNTDOWN:

@@ -36,6 +36,7 @@ class TakeState:
         status: what was decided.
         decided_by: "operator" or "machine"; empty while undecided.
         overruled: the verdict that the operator did not follow, or None.
+        cut: whether it was closed before its end; it is then not kept without a key.
     """
 
     name: str
@@ -48,6 +49,7 @@ class TakeState:
     status: TakeStatus = TakeStatus.UNDECIDED
     decided_by: str = ""
     overruled: Overrule | None = None
+    cut: bool = False
 
     @property
     def shown_colour(self) -> Colour | None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -13,8 +12,9 @@ import numpy as np
 from capture.arrays import Floats
 from capture.clock_model import ClockModel
 from capture.devices.protocol import ClockSample
+from capture.documents import plain_json
 from capture.errors import SettingsError
-from capture.judgement import Colour
+from capture.judgement import Colour, worst_colour
 from capture.ledger import Ledger
 from capture.sync_report.findings import SyncFacts, SyncFinding, colour_of, find_all
 from capture.sync_report.times import (
@@ -101,7 +101,7 @@ class SyncReport:
 
     def document(self) -> dict[str, Any]:
         """The report as plain values for a JSON file; None where a number is not known."""
-        plain: dict[str, Any] = _plain(dataclasses.asdict(self))
+        plain: dict[str, Any] = plain_json(dataclasses.asdict(self))
         return plain
 
 
@@ -202,7 +202,7 @@ def _device(facts: SyncFacts, name: str, frames: int) -> DeviceSync:
 def _colour(spread: Floats, findings: Sequence[SyncFinding]) -> Colour:
     colours = {finding.colour for finding in findings}
     colours.add(colour_of(float(spread.max())) if len(spread) else Colour.RED)
-    return next(c for c in (Colour.RED, Colour.AMBER, Colour.GREEN) if c in colours)
+    return worst_colour(colours)
 
 
 def _sentence(facts: SyncFacts, colour: Colour, findings: Sequence[SyncFinding]) -> str:
@@ -242,15 +242,3 @@ def _unseen(facts: SyncFacts) -> str:
 
 def _shown(us: float) -> str:
     return f"{us:.0f}" if us >= 10 else f"{us:.1f}"
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    if isinstance(value, SyncBasis | Colour):
-        return value.value
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    return value

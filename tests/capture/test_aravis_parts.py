@@ -11,11 +11,9 @@ import pytest
 from capture.devices.aravis.formats import check_format, is_known, layout_of
 from capture.devices.aravis.network import (
     address_problems,
-    host_problems,
     interface_of,
     interfaces,
     packet_pause_ns,
-    packet_problems,
 )
 from capture.errors import DeviceError
 from capture.frame_header import ImageLayout
@@ -85,18 +83,6 @@ def test_the_hosts_own_address_is_in_reach_and_a_strangers_is_not() -> None:
     (problem,) = address_problems("203.0.113.7")
     assert problem.startswith("its address 203.0.113.7 is in no network of this host (")
     assert f"{loopback.name} 127.0.0.1/8" in problem
-
-
-def test_short_packets_are_told_with_what_to_mend() -> None:
-    assert packet_problems(9000, 9000) == ()
-    assert packet_problems(1500, 9000) == (
-        "packets of 1500 bytes although the host takes 9000: check the switch, and the device's "
-        "limit",
-    )
-    (problem,) = packet_problems(1500, 1500)
-    assert problem.endswith("set MTU 9000 on the host's interface, the switch and the device")
-    for problem in host_problems():
-        assert "sudo sysctl -w net.core.rmem_max=10000000" in problem
 
 
 def test_a_paced_frame_takes_the_time_that_it_may() -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from capture.clock_model import ClockModel
 from capture.collate import Collator, DeviceClock, TriggerTrain
-from capture.devices.protocol import DeviceInfo, TriggerKind
+from capture.devices.protocol import ClockKind, DeviceInfo, TriggerKind
 from capture.devices.simulated import Fault, FaultKind, SimulatedSettings
 from capture.errors import SettingsError
 from capture.frame import FrameEvent
@@ -303,6 +303,67 @@ def test_a_host_that_is_late_by_turns_does_not_hide_a_missed_trigger() -> None:
     ledger = collated(rows).ledger(0, 10)
     assert verdicts(ledger, "cam00") == {7: "missed_trigger"}
     assert ledger.remarks == ()
+
+
+@pytest.mark.parametrize("late", [0.4, 0.55, 0.7, 0.9, 1.4, 3.0])
+def test_a_first_frame_that_the_host_dates_late_makes_no_later_one_stale(late: float) -> None:
+    """A cold start: later frames come sooner after their exposure than any frame before."""
+    rows = [(1, late, late + 0.1), *((1 + k, k, k + 0.1) for k in range(1, 40))]
+    ledger = collated(rows).ledger(0, 40)
+    first = min(e.trigger_index for e in ledger.entries if e.verdict == Verdict.OK)
+    placed = [e.trigger_index for e in ledger.entries if e.frame_id > 0]
+    assert placed == list(range(first, 40))
+    assert {r.oddity for r in ledger.remarks} <= {Oddity.CLOCK_STEP}
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_dates_that_are_off_by_half_a_period_move_no_frame(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    off = rng.uniform(0.0, 0.6, 300)
+    rows = [(1 + k, k + off[k], k + off[k] + 0.05) for k in range(300)]
+    steps_told = {}
+    for clock in (ClockKind.OWN, ClockKind.HOST):
+        collator = Collator(
+            [replace(INFO, clock=clock)], TriggerTrain(0, 1000),
+            {"cam00": DeviceClock(ClockModel(0, 0), fitted=clock == ClockKind.OWN)},
+        )  # fmt: skip
+        places = [collator.add(frame(*row)) for row in rows]
+        assert places == list(range(places[0] or 0, (places[0] or 0) + 300))
+        remarks = collator.ledger(0, 300).remarks
+        assert {r.oddity for r in remarks} <= {Oddity.CLOCK_STEP}
+        steps_told[clock] = len(remarks)
+    # The host's own clock does not jump by a third of a period: its driver was late.
+    assert steps_told[ClockKind.HOST] < 30 < steps_told[ClockKind.OWN]
+
+
+@pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in (1, 2, 3))])
+def test_a_device_that_was_silent_for_an_hour_is_filed_with_the_others(seed: int) -> None:
+    """The generator and the clocks are off by a hundred millionths: 3.6 periods in that time."""
+    rng = np.random.default_rng(seed)
+    period, hour = 100_000_000, 36_000
+    true_ns = period * (1 + rng.choice([-1e-4, 1e-4]))
+    infos = [replace(INFO, name=name, id_bits=32) for name in ("cam00", "cam01", "cam02")]
+    drifts = dict(zip((info.name for info in infos), rng.uniform(-4e-5, 4e-5, 3), strict=True))
+    clocks = {info.name: DeviceClock(ClockModel(0, 0)) for info in infos}
+    collator = Collator(infos, TriggerTrain(0, period), clocks)
+    missed = 0
+    for k in range(hour + 1200):
+        for place, (name, drift) in enumerate(drifts.items()):
+            if place == 1 and 1000 <= k < hour + 1000:
+                missed += 1
+                continue
+            t_ns = round(k * true_ns + rng.normal(0, 1000))
+            late_ns = 20_000_000 + round(abs(rng.normal(0, 2e6)))
+            event = FrameEvent(
+                name, 1 + k - (missed if place == 1 else 0), round(t_ns * (1 + drift)),
+                t_ns + late_ns, 0,
+            )  # fmt: skip
+            assert collator.add(event) == k
+        if k % 5 == 0:
+            collator.follow()
+        if k % 256 == 0:
+            collator.forget(k - 300)
+    assert collator.ledger(hour + 900, 200).remarks == ()
 
 
 def test_a_train_without_a_period_is_refused() -> None:

@@ -3,16 +3,27 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from capture.arrays import Image
 from capture.device_watch import DeviceState
 from capture.devices.array import DeviceArray
 from capture.devices.faults import Fault, FaultKind
-from capture.devices.simulated import Stamp, pattern, streaming_array
+from capture.devices.lines import RealTimeLine
+from capture.devices.simulated import (
+    Stamp,
+    StreamingDevice,
+    pattern,
+    streaming_array,
+    streaming_settings,
+)
 from capture.errors import DeviceError, TakeError
+from capture.frame import FrameEvent
 from capture.frame_header import ImageLayout
 from capture.judgement import Colour
 from capture.ledger import Verdict
@@ -26,6 +37,7 @@ from tests.capture.recording import verdicts
 LAYOUT = ImageLayout(24, 16, 1, "uint8")
 SETTINGS = RecordSettings(rate_hz=100, exposure_us=1000, pre_roll=10, post_roll=5)
 SMILE = Shot(slate="smile", kind="expression", frames=20)
+REST = Shot(slate="rest", kind="neutral", frames=5000)
 
 
 def array_of(count: int = 3, seed: int = 0) -> DeviceArray:
@@ -225,3 +237,103 @@ def test_the_disk_that_cannot_take_a_take_is_named_and_the_array_goes_on(tmp_pat
         assert done(live.record(session, SMILE)).ledger().counts()[Verdict.OK] == 105
         time.sleep(1.2)
         assert all(state.taken <= 20 for state in live.states())
+
+
+class Odd(StreamingDevice):
+    """A third party's device with a mistake in it: raises what no device may, where it is told."""
+
+    where = ""
+
+    def poll(self) -> Sequence[FrameEvent]:
+        if self.where == "poll":
+            raise ValueError("an odd thing")
+        return super().poll()
+
+    def pixels(self, event: FrameEvent) -> Image:
+        if self.where == "pixels":
+            raise ValueError("an odd thing")
+        return super().pixels(event)
+
+
+def odd_array() -> DeviceArray:
+    line = RealTimeLine()
+    made = [Odd(f"cam{k:02d}", LAYOUT, line, streaming_settings(k)) for k in range(3)]
+    return DeviceArray(tuple(made), line)
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_an_error_that_nobody_foresaw_ends_the_stream_and_keeps_the_take(tmp_path: Path) -> None:
+    array = odd_array()
+    live = LiveArray(array, SETTINGS)
+    live.start()
+    take = live.record(Session.create(tmp_path / "s"), REST)
+    time.sleep(0.3)
+    array.devices[1].where = "poll"  # type: ignore[attr-defined]
+    opened = done(take)
+    assert 10 < opened.manifest.frame_count < 1000
+    assert "ValueError('an odd thing')" in live.trouble
+    assert not live.running
+    with pytest.raises(DeviceError, match="an odd thing"):
+        live.record(Session.open(tmp_path / "s"), SMILE)
+    array.devices[1].where = ""  # type: ignore[attr-defined]
+    live.start()  # takes it up again, as the operator does
+    time.sleep(0.15)
+    assert done(live.record(Session.open(tmp_path / "s"), SMILE)).ledger().counts()["ok"] == 105  # type: ignore[index]
+    live.stop()
+
+
+def test_an_error_that_nobody_foresaw_ends_one_frame_and_not_the_lane(tmp_path: Path) -> None:
+    array = odd_array()
+    with LiveArray(array, replace(SETTINGS, pre_roll=0)) as live:
+        session = Session.create(tmp_path / "s")
+        take = live.record(session, replace(SMILE, frames=40))
+        array.devices[1].where = "pixels"  # type: ignore[attr-defined]
+        taken = done(take)
+        array.devices[1].where = ""  # type: ignore[attr-defined]
+        assert done(live.record(session, SMILE)).ledger().counts()[Verdict.OK] == 75
+    ledger = taken.ledger()
+    gone = verdicts(ledger, "cam01")
+    assert verdicts(ledger, "cam00") == verdicts(ledger, "cam02") == {}
+    assert set(gone.values()) == {"lost"}
+    assert ledger.entry(max(gone), "cam01").note == "not written: ValueError('an odd thing')"
+    assert "of cam01 could not be written" in taken.manifest.remarks["judgement"]["sentence"]
+    check_pixels(taken)
+
+
+def test_an_array_that_is_stopped_while_the_files_of_a_take_are_still_being_made(
+    tmp_path: Path,
+) -> None:
+    """A slow disk: its frames wait in memory, and the lanes must outlive that."""
+    live = LiveArray(array_of(), SETTINGS)
+    live.start()
+    time.sleep(0.12)
+    session = Session.create(tmp_path / "s")
+    takes = [live.record(session, SMILE) for _ in range(3)]
+    live.stop()
+    for take in takes:
+        assert done(take).ledger().triggers >= 1
+
+
+def test_a_disk_that_is_full_ends_no_take_and_what_was_written_stays(small_disk: Path) -> None:
+    """What devices are set to is written while there is room; then frames take all of it."""
+    array = streaming_array(3, ImageLayout(128, 128, 1, "uint8"))
+    with LiveArray(array, SETTINGS) as live:
+        until(lambda: all(live.health().values()) and len(live.health()) == 3)
+        time.sleep(0.1)
+        session = Session.create(small_disk / "s")
+        take = done(live.record(session, replace(SMILE, frames=80)))
+        assert live.trouble == ""
+        assert live.running
+    ledger = take.ledger()
+    counts = ledger.counts()
+    assert counts[Verdict.OK] > 20
+    assert counts[Verdict.OK] + counts[Verdict.LOST] == 3 * 95
+    notes = {entry.note for entry in ledger.entries if entry.verdict == Verdict.LOST}
+    assert all("cannot be written: No space left on device" in note for note in notes)
+    for name in take.device_names:
+        there = {header.trigger_index for header in take.reader(name).headers}
+        ok = {k for k in range(95) if ledger.entry(k, name).verdict == Verdict.OK}
+        assert there == ok
+    assert sorted(path.name for path in (take.folder / "features").glob("*.json")) == [
+        "cam00.json", "cam01.json", "cam02.json",
+    ]  # fmt: skip

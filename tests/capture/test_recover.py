@@ -248,3 +248,46 @@ def test_other_folders_are_refused(tmp_path: Path) -> None:
         recover_take(tmp_path / "nowhere")
     with pytest.raises(TakeError, match=r"expected a take, found no take\.json"):
         recover_take(tmp_path)
+
+
+@pytest.mark.parametrize("place", ["frames", "frames/cam00.mcap.partial", "damaged"])
+def test_a_link_in_it_is_refused_and_what_it_leads_to_stays_as_it_is(
+    tmp_path: Path, place: str
+) -> None:
+    folder = record(tmp_path / "smile_001", frames=3)
+    path = file_of(folder, "cam00")
+    os.truncate(path, path.stat().st_size - 40)  # recovery would cut the rest off
+    outside = tmp_path / "outside"
+    (outside / "damaged").mkdir(parents=True)
+    if (folder / place).exists():
+        (folder / place).rename(outside / "there")
+        (folder / place).symlink_to(outside / "there")
+    else:
+        (folder / place).symlink_to(outside / "damaged")
+    before = {p: p.read_bytes() for p in outside.rglob("*") if p.is_file()}
+    recovery = recover_take(folder)
+    assert recovery.outcome == Outcome.FAILED
+    assert f"{folder / place}: is a link, and a recording makes none" in recovery.sentence
+    assert {p: p.read_bytes() for p in outside.rglob("*") if p.is_file()} == before
+
+
+def test_what_the_system_refuses_fails_one_take_and_not_the_others(tmp_path: Path) -> None:
+    session = Session.create(tmp_path / "s")
+    for number in (1, 2):
+        record(session.folder / "takes" / f"smile_{number:03d}", frames=2)
+    (session.folder / "takes" / "smile_001.partial" / ".room").mkdir()
+    first, second = recover_session(session)
+    assert (first.outcome, second.outcome) == (Outcome.FAILED, Outcome.SETTLED)
+    assert "smile_001.partial/.room: Is a directory" in first.sentence
+
+
+def test_a_summary_that_claims_more_than_the_file_can_hold_is_not_read(tmp_path: Path) -> None:
+    folder = record(tmp_path / "smile_001", frames=2, planned=2, closed=True)
+    path = file_of(folder, "cam00")
+    end = path.read_bytes()[-37:]  # footer and magic
+    with path.open("r+b") as file:
+        os.truncate(file.fileno(), 1 << 42)  # 4 TiB of nothing: the summary would be all of it
+        file.seek(-len(end), os.SEEK_END)
+        file.write(end)
+    reader = FrameReader(path)
+    assert (len(reader), reader.closed_well) == (2, False)

@@ -236,7 +236,15 @@ def test_verify_finds_what_is_wrong(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "odd", [{"take_number": "1"}, {"shot": ["smile"]}, {"shot": {"slate": 3}}, {"judgement": None}]
+    "odd",
+    [
+        {"take_number": "1"},
+        {"shot": ["smile"]},
+        {"shot": {"slate": 3}},
+        {"shot": {"slate": "../smile", "kind": "expression"}},
+        {"judgement": None},
+        {"judgement": {"colour": "blue", "sentence": "x"}},
+    ],
 )
 def test_a_take_that_does_not_say_what_was_recorded_is_named(
     tmp_path: Path, odd: dict[str, object]
@@ -247,8 +255,12 @@ def test_a_take_that_does_not_say_what_was_recorded_is_named(
     document = json.loads(path.read_text())
     document["remarks"].update(odd)
     path.write_text(json.dumps(document))
+    record_take(session, SMILE, array_of(), RecordSettings())
     with pytest.raises(TakeError, match=r"smile_001/take\.json: damaged manifest: remarks must"):
         session.takes()
+    damaged: list[str] = []
+    assert [note.take_number for note in session.takes(damaged)] == [2]
+    assert "smile_001/take.json" in damaged[0]
 
 
 def test_the_take_that_the_operator_kept_counts_though_a_later_one_stands_there(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +12,8 @@ from capture.devices.array import DeviceArray
 from capture.devices.faults import Fault, FaultKind
 from capture.devices.protocol import ClockKind, TriggerKind
 from capture.devices.simulated import SimulatedDevice, SimulatedLine, SimulatedSettings
-from capture.frame import Clock
+from capture.errors import DeviceError
+from capture.frame import Clock, FrameEvent
 from capture.ledger import Verdict
 from capture.recorder import RecordSettings
 from capture.stream import Stream
@@ -126,6 +128,63 @@ def test_what_is_over_is_forgotten() -> None:
     assert window.recording.ledger.counts()[Verdict.OK] == 10
 
 
+def test_what_is_over_is_forgotten_though_a_device_died_and_its_last_frames_are_in_the_ring() -> (
+    None
+):
+    faults = [Fault(FaultKind.MISS_TRIGGER, k) for k in range(300, 1500)]
+    array = array_of(2, faults={"cam01": faults})
+    stream = Stream(array, SETTINGS, ring_frames=4)
+    stream.start()
+    advance(stream, 1200)
+    assert stream.latest()["cam01"].trigger_index == 299
+    tracks = stream._collator._tracks.values()  # type: ignore[union-attr]
+    assert all(len(track.placed) < 600 for track in tracks)
+
+
+def test_windows_that_are_open_when_the_array_stops_end_with_what_was_sent() -> None:
+    stream = Stream(array_of(2), SETTINGS)
+    stream.start()
+    window = stream.open(0, 500, lambda frame: frame.done())
+    advance(stream, 20)
+    stream.stop()
+    assert window.closed.is_set()
+    assert window.recording is not None
+    assert window.recording.ledger.triggers == 20
+    with pytest.raises(DeviceError, match="does not stream any more"):
+        stream.open(20, 5, lambda frame: frame.done())
+
+
+class OutOfReach(SimulatedDevice):
+    """Cannot be asked for frames while `why` is not empty."""
+
+    why = ""
+
+    def poll(self) -> Sequence[FrameEvent]:
+        if self.why:
+            raise DeviceError(self.why)
+        return super().poll()
+
+
+def test_a_device_that_cannot_be_asked_for_frames_is_told_of_and_the_others_go_on() -> None:
+    line = SimulatedLine()
+    array = DeviceArray(
+        tuple(OutOfReach(c, StampScene(), line, SimulatedSettings()) for c in cameras(2)), line
+    )
+    stream = Stream(array, SETTINGS)
+    stream.start()
+    window = stream.open(0, 20, lambda frame: frame.done())
+    advance(stream, 10)
+    array.devices[1].why = "cam01: unplugged"  # type: ignore[attr-defined]
+    advance(stream, 40)
+    assert stream.counts["cam01"].trouble == "cam01: unplugged"
+    assert window.recording is not None
+    assert verdicts(window.recording.ledger, "cam00") == {}
+    assert set(verdicts(window.recording.ledger, "cam01").values()) == {"missing"}
+    array.devices[1].why = ""  # type: ignore[attr-defined]
+    advance(stream, 3)
+    assert stream.counts["cam01"].trouble == ""
+
+
 def test_a_window_may_end_early_and_keeps_what_was_exposed() -> None:
     stream = Stream(array_of(2), SETTINGS)
     stream.start()
@@ -220,6 +279,25 @@ def test_a_window_opens_now_though_the_generator_runs_at_another_pace() -> None:
     assert window.recording.ledger.counts()[Verdict.OK] == 60
     first = min(e.t_host_ns for e in window.recording.ledger.entries)
     assert -PERIOD < first - asked_ns < 3 * PERIOD
+
+
+def test_a_device_found_again_is_filed_with_the_others_though_the_generator_has_slipped() -> None:
+    line = OutsideLine(5_000_000_000, round(PERIOD * 1.0008))
+    array = DeviceArray(wired(line, 1), line)
+    stream = Stream(array, SETTINGS)
+    stream.start()
+    run(stream, 60)  # 3.6 periods of slip
+    found = array.devices[1]
+    stream.restart("cam01", [found.latch() for _ in range(4)])  # type: ignore[attr-defined]
+    run(stream, 1)
+    window = stream.open(stream.next_index, 20, lambda frame: frame.done())
+    run(stream, 1)
+    assert window.recording is not None
+    ledger = window.recording.ledger
+    assert ledger.counts()[Verdict.OK] == 60
+    for k in range(20):  # latencies are 3 to 9 ms
+        arrivals = [ledger.entry(k, name).t_host_ns for name in ledger.devices]
+        assert max(arrivals) - min(arrivals) < 7_000_000
 
 
 @pytest.mark.parametrize("seed", range(4))

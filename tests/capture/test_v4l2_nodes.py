@@ -12,7 +12,7 @@ from capture.devices.backend import load_backend
 from capture.devices.v4l2 import backend
 from capture.errors import DeviceError
 from capture.frame import FrameEvent
-from capture.ledger import Oddity, Verdict
+from capture.ledger import Verdict
 from tests.capture.v4l2_driver import PERIOD_NS, PlayedDriver, device_of
 
 
@@ -59,4 +59,4 @@ def test_a_late_stamp_moves_no_frame_of_a_stalled_host() -> None:
         assert collator.add(event) == number
     ledger = collator.ledger(0, 40)
     assert ledger.counts()[Verdict.OK] == 40
-    assert {remark.oddity for remark in ledger.remarks} == {Oddity.CLOCK_STEP}
+    assert ledger.remarks == ()  # the host's own clock does not step by parts of a period

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import threading
 from collections.abc import Callable
@@ -96,3 +97,24 @@ def test_a_file_that_is_gone_is_a_problem_of_one_device(take: Take) -> None:
     report = verify_take(opened)
     assert report.frames == 10
     assert any("cam01.mcap: no such file" in problem for problem in report.problems)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("features/gone.json", "features/gone.json: stands in manifest-sha256.txt, and there is"),
+        ("features/pipe", "features/pipe: stands in manifest-sha256.txt, and there is no such"),
+        ("features/link", "features/link: a link leads out of the take to "),
+        ("features/a\0b", "there is no such file"),
+    ],
+)
+def test_a_hostile_list_of_hashes_leads_to_nothing_outside_the_take(
+    take: Take, name: str, words: str
+) -> None:
+    (take.folder / "features").mkdir()
+    os.mkfifo(take.folder / "features" / "pipe")
+    (take.folder.parent / "secret").write_text("x")
+    (take.folder / "features" / "link").symlink_to(take.folder.parent / "secret")
+    sums = take.folder / "manifest-sha256.txt"
+    sums.write_text(sums.read_text() + "0" * 64 + f"  {name}\n")
+    assert any(words in problem for problem in verify_take(Take.open(take.folder)).problems)

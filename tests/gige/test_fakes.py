@@ -14,6 +14,7 @@ import pytest
 from capture.devices.aravis import backend
 from capture.devices.capabilities import (
     ActionTriggered,
+    Cautioned,
     Featured,
     Latching,
     Monitored,
@@ -150,12 +151,12 @@ def test_packets_are_as_long_as_the_network_takes_and_that_is_read_back(
         device.start()
         assert device.read_feature("GevSCPSPacketSize") == 9000
         assert device.health().counters["packet_bytes"] == 9000
-        assert not [one for one in device.problems if "packets of" in one]
         device.stop()
         device.write_feature("GevSCPSPacketSize", 1500)  # asked for: it is not negotiated away
         device.start()
         assert device.health().counters["packet_bytes"] == 1500
-        assert [one for one in device.problems if one.startswith("packets of 1500 bytes")]
+        assert isinstance(device, Cautioned)
+        assert device.problems == ()
     finally:
         device.close()
 
@@ -248,8 +249,8 @@ def test_a_device_that_is_dropped_while_it_streams_lets_go_of_all(fakes: FakeNet
 
 
 def _listen(device: object, enough: object, *others: object) -> None:
-    """Poll and release until there is enough, 5 s at most."""
-    deadline = time.monotonic() + 5.0
+    """Poll and release until there is enough, 15 s at most."""
+    deadline = time.monotonic() + 15.0
     while time.monotonic() < deadline:
         for one in (device, *others):
             for event in one.poll():  # type: ignore[attr-defined]

@@ -104,16 +104,28 @@ def test_a_session_runs_without_keys_and_reports_every_take(
 def test_a_setting_that_does_not_read_back_stops_the_session_unless_overruled(
     stage: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    write_gain(stage, 6.27)
+    write_gain(stage, 1.27)
     array = ["--array", str(stage / "array.toml")]
     assert main(words(stage, *array)) == 1
     told = capsys.readouterr().err
-    assert "left is not set as preset gain.preset says: Gain: asked for 6.27, reads 6.3" in told
+    assert "left is not set as preset gain.preset says: Gain: asked for 1.27, reads 1.3" in told
     assert "Traceback" not in told
     assert main(words(stage, *array, "--overrule", "--json")) == 0
     report = json.loads(capsys.readouterr().out)
     assert kept(report) == {"neutral", "smile"}
-    assert "Gain: asked for 6.27, reads 6.3" in report["remarks"][0]
+    assert "Gain: asked for 1.27, reads 1.3" in report["remarks"][0]
+
+
+def test_a_setting_that_a_device_rounds_a_little_is_told_and_stops_nothing(
+    stage: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_gain(stage, 6.27)
+    assert main(words(stage, "--array", str(stage / "array.toml"), "--json")) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert kept(report) == {"neutral", "smile"}
+    assert report["check"][0].startswith(
+        "amber: left rounds preset gain.preset: Gain: asked for 6.27, reads 6.3"
+    )
 
 
 def test_simulated_devices_need_no_array_file(
@@ -138,7 +150,7 @@ def test_a_red_take_is_taken_again_and_the_red_one_is_kept(stage: Path) -> None:
     spoilt: list[int] = []
 
     def progress(done: int, total: int, what: str) -> None:
-        if not spoilt:  # the array is armed, the first take about to begin
+        if not spoilt and what.startswith("session"):  # armed, the first take about to begin
             spoilt.append(done)
             devices[1].inject(Fault(FaultKind.LOSE_FRAME, triggers=15))
 

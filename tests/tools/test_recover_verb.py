@@ -79,3 +79,18 @@ def test_what_cannot_be_recovered_is_a_failure_and_stays(
     assert "smile_002: exists already; move it away" in capsys.readouterr().err
     assert (session / "takes" / "smile_002.partial").is_dir()
     assert main(["recover", str(session / "nowhere")]) == 2
+
+
+def test_a_take_that_lost_its_manifest_is_no_sound_session(
+    session: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    main(["recover", str(session)])
+    (session / "takes" / "notes of the day").mkdir()  # no take at all
+    assert main(["verify", str(session)]) == 0
+    (session / "takes" / "smile_001" / "take.json").unlink()
+    (session / "takes" / "smile_002" / "frames" / "cam01.mcap").unlink()
+    assert main(["verify", str(session)]) == 1
+    said = capsys.readouterr().err
+    assert "smile_001: 1 problems" not in said
+    assert "takes/smile_001: expected a take, found no take.json" in said
+    assert "frames/cam01.mcap is missing" in said

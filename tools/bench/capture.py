@@ -17,7 +17,6 @@ import tempfile
 from pathlib import Path
 
 from capture.frame_header import ImageLayout
-from tools.bench.bench_mcap import bench_lines
 from tools.bench.capture_array import record_array, session_memory
 
 _PARTS = ("writers", "array", "memory")
@@ -49,6 +48,9 @@ def main() -> None:
     with tempfile.TemporaryDirectory(dir=arguments.folder) as folder:
         place = Path(folder)
         if parts == ["writers"]:
+            # Its opponent is a package of the tests: the other parts run with numpy alone.
+            from tools.bench.bench_mcap import bench_lines
+
             lines = bench_lines(place)
         elif parts == ["array"]:
             lines = record_array(arguments.devices, layout, arguments.seconds, place).lines()

@@ -26,6 +26,8 @@ class ArrayRun:
         cores: CPU seconds a second while recording; the simulation, collation, CRC and writing.
         idle_cores: the same while the array streams and nothing is written.
         verify_ratio: time to read the take back, CRC and SHA-256, over the time it took to record.
+        drain_s: from the end of the window until all was written.
+        memory_share: the most of a device's memory that was ever in use; of one look a second.
         mb_per_s: written.
         devices: how many.
     """
@@ -36,6 +38,8 @@ class ArrayRun:
     cores: float
     idle_cores: float
     verify_ratio: float
+    drain_s: float
+    memory_share: float
     mb_per_s: float
     devices: int
 
@@ -45,7 +49,9 @@ class ArrayRun:
             f"{self.devices} devices, 75 Hz, {self.seconds:.0f} s: {self.lost} of "
             f"{self.frame_sets} frame sets lost, {self.mb_per_s:.0f} MB/s, {self.cores:.2f} cores "
             f"(streaming alone {self.idle_cores:.2f})",
-            f"read back in {self.verify_ratio:.2f} of the time it took to record",
+            f"written {self.drain_s:.2f} s after the last trigger, at most "
+            f"{self.memory_share:.0%} of the memory in use; read back, CRC and SHA-256, in "
+            f"{self.verify_ratio:.2f} of the time it took to record",
         ]
 
 
@@ -56,11 +62,13 @@ def record_array(devices: int, layout: ImageLayout, seconds: float, folder: Path
     with LiveArray(streaming_array(devices, layout), settings) as live:
         idle_cores = _cores(3.0)
         frames = round(seconds * settings.rate_hz)
-        began, cpu = time.monotonic(), time.process_time()
+        began, cpu, high = time.monotonic(), time.process_time(), 0
         take = live.record(session, Shot(slate="bench", kind="expression", frames=frames))
         while take.phase == TakePhase.RECORDING:
-            time.sleep(0.01)
-        cores = (time.process_time() - cpu) / (time.monotonic() - began)
+            high = max(high, *(state.taken for state in live.states()))
+            time.sleep(0.05)
+        over = time.monotonic()
+        cores = (time.process_time() - cpu) / (over - began)
         while take.phase == TakePhase.DRAINING:
             time.sleep(0.001)
         checked = time.monotonic()
@@ -77,6 +85,8 @@ def record_array(devices: int, layout: ImageLayout, seconds: float, folder: Path
         cores=cores,
         idle_cores=idle_cores,
         verify_ratio=check_s / recorded_s,
+        drain_s=checked - over,
+        memory_share=high / settings.ring_frames,
         mb_per_s=devices * layout.nbytes * settings.rate_hz / 1e6,
         devices=devices,
     )

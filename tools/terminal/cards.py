@@ -134,14 +134,21 @@ def device_troubles(devices: Sequence[DeviceState]) -> list[str]:
 
 
 def take_list(view: View, chosen: str, width: int, height: int) -> Content:
-    """The newest takes first, around the chosen one."""
+    """The newest takes first, around the chosen one, which says in full why it is not green."""
     takes = list(reversed(view.takes))
     if not takes:
         return Content.styled("no take yet", "dim")
     at = next((n for n, take in enumerate(takes) if take.name == chosen), 0)
-    first = max(0, min(at - height // 2, len(takes) - height))
-    lines = []
-    for take in takes[first : first + height]:
+    full = []
+    if takes[at].name == chosen and takes[at].colour in (Colour.AMBER, Colour.RED):
+        full = _take_line(takes[at], ">").wrap(max(width, 1))[:height]
+    rows = height - max(len(full) - 1, 0)
+    first = max(0, min(at - rows // 2, len(takes) - rows))
+    lines: list[Content] = []
+    for take in takes[first : first + rows]:
+        if full and take.name == chosen:
+            lines += full
+            continue
         mark = ">" if take.name == chosen else " "
         lines.append(_take_line(take, mark).truncate(width, ellipsis=True))
     return Content("\n").join(lines)

@@ -12,6 +12,7 @@ from textual.content import Content
 from textual.widgets import Digits, Input, Static
 
 from capture.errors import LikenessError
+from capture.judgement import Colour
 from capture.live_take import TakePhase
 from capture.rom.conductor import Conductor
 from capture.rom.events import Key
@@ -176,6 +177,9 @@ class Console(App[None]):
             self._tell("nothing to overrule: no take yet")
             return
         name = "" if of_check or take is None else take.name
+        if name and take is not None and take.colour == Colour.GREEN:
+            self._key(Key.OVERRULE, take=name)  # is refused: nobody is asked for a reason in vain
+            return
 
         def answered(reason: str | None) -> None:
             if reason is not None:

@@ -25,6 +25,7 @@ from capture.devices.preset import read_preset
 from capture.devices.roster import Finding as RosterFinding
 from capture.devices.roster import compare, look
 from capture.errors import InputError
+from capture.judgement import Colour
 from capture.live import LiveArray
 from capture.preflight import Finding, PreflightSettings, Subject, preflight
 from capture.progress import Progress
@@ -36,7 +37,7 @@ from tools.verbs.capture_unattended import Rehearsal, run_unattended
 from tools.verbs.options import Options
 
 REQUIRED = ("session",)
-_OPEN = ("", "current", "retake")  # of a prompt: it has no take that counts
+_SETTLED = ("keep", "flag", "skipped")  # of a prompt: it has a take that counts, or needs none
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,7 +110,7 @@ def _open_console(conductor: Conductor, names: tuple[str, ...], remarks: list[st
         Console(conductor, names, remarks=remarks).run()
     finally:
         logger.removeHandler(listener)
-    print("takes that are still being written are finished ...", file=sys.stderr)
+    print("the devices stop; takes that are still being written are finished ...", file=sys.stderr)
 
 
 class _Listener(logging.Handler):
@@ -126,13 +127,13 @@ class _Listener(logging.Handler):
 
 def _checker(
     live: LiveArray, file: ArrayFile, roster: Sequence[RosterFinding], arguments: Arguments
-) -> Callable[[], Sequence[Finding]]:
+) -> Callable[[Progress], Sequence[Finding]]:
     """The check of the array, as the conductor calls it."""
     presets = {
         entry.name: read_preset(entry.preset) for entry in file.devices if entry.preset is not None
     }
     subject = Subject(live=live, session=arguments.session, roster=roster, presets=presets)
-    return lambda: preflight(subject, arguments.settings)
+    return lambda heard: preflight(subject, arguments.settings, progress=heard)
 
 
 def _roster(file: ArrayFile) -> tuple[RosterFinding, ...]:
@@ -146,7 +147,7 @@ def _roster(file: ArrayFile) -> tuple[RosterFinding, ...]:
 
 def _array_file(arguments: Arguments) -> ArrayFile:
     if (arguments.array is None) == (arguments.simulate is None):
-        raise InputError("capture: give either --array array.toml or --simulate NUMBER")
+        raise InputError("give either --array array.toml or --simulate NUMBER")
     if arguments.array is not None:
         return read_array_file(arguments.array)
     return simulated_array_file(arguments.simulate or 0)
@@ -155,7 +156,7 @@ def _array_file(arguments: Arguments) -> ArrayFile:
 def _check_console() -> None:
     if not sys.stdin.isatty():
         raise InputError(
-            "capture: the console needs a terminal and stdin is none; use --unattended to run all "
+            "the console needs a terminal and stdin is none; use --unattended to run all "
             "prompts without keys"
         )
 
@@ -165,10 +166,16 @@ def _report(view: View, remarks: list[str], everything: bool) -> dict[str, Any]:
     takes = view.takes
     colours = Counter(str(take.colour) for take in takes if take.colour is not None)
     decisions = Counter(str(take.note.status) for take in takes)
-    left = [line.prompt.slate for line in view.prompts if line.status in _OPEN]
+    left = [line.prompt.slate for line in view.prompts if line.status not in _SETTLED]
+    check = [
+        f"{one.colour}: {one.sentence} {one.remedy}".rstrip()
+        for one in view.findings
+        if one.colour != Colour.GREEN
+    ]
     if not everything:
         return {
             "session": view.session,
+            **{f"check {n}": told for n, told in enumerate(check, start=1)},
             "takes": f"{len(takes)} ({_counted(colours)}; {_counted(decisions)})",
             "prompts left": ", ".join(left) or "none",
             **{f"remark {n}": told for n, told in enumerate(remarks, start=1)},
@@ -177,6 +184,7 @@ def _report(view: View, remarks: list[str], everything: bool) -> dict[str, Any]:
     return {
         "session": view.session, "takes": len(takes), **colours, "decisions": dict(decisions),
         "finished": view.finished, "prompts_left": left, "remarks": remarks,
+        "check": check,
         "list": [
             {
                 "take": take.name, "slate": take.slate, "number": take.number,

@@ -53,6 +53,7 @@ def run_unattended(conductor: Conductor, rehearsal: Rehearsal, progress: Progres
         DeviceError: when the devices cannot be started, or the check is red.
         WorkError: when the session stands still.
     """
+    progress(0, len(conductor.view().prompts), "the devices are started and checked")
     view = _arm(conductor, rehearsal)
     while True:
         _tell(view, progress)

@@ -6,7 +6,6 @@ Example: likeness devices --array array.toml
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ from capture.devices.capabilities import Featured
 from capture.devices.preset import apply_preset, read_preset
 from capture.devices.protocol import Device
 from capture.devices.roster import Finding, Sighting, all_there, compare, look
+from capture.documents import write_json
 from capture.errors import DeviceError, InputError, WorkError
 from capture.product import replacing
 from capture.progress import Progress
@@ -55,6 +55,9 @@ def run(arguments: Arguments, progress: Progress) -> dict[str, Any]:
     _check(arguments)
     array = None if arguments.array is None else read_array_file(arguments.array)
     backends = arguments.backend or None
+    listed = () if array is None else array.devices
+    for name in dict.fromkeys(entry.backend for entry in listed):
+        load_backend(name)  # a slip in the array file is no device that is missing
     progress(0, 1, "look for devices")
     sighting = look(backends)
     progress(1, 1, "look for devices")
@@ -72,11 +75,11 @@ def run(arguments: Arguments, progress: Progress) -> dict[str, Any]:
 
 def _check(arguments: Arguments) -> None:
     if (arguments.features is None) != (arguments.out is None):
-        raise InputError("devices: --features DEVICE and --out FILE belong together")
+        raise InputError("--features DEVICE and --out FILE belong together")
     if (arguments.preset is None) != (arguments.device is None):
-        raise InputError("devices: --preset FILE and --device DEVICE belong together")
+        raise InputError("--preset FILE and --device DEVICE belong together")
     if arguments.features is not None and arguments.preset is not None:
-        raise InputError("devices: --features and --preset are two pieces of work; run it twice")
+        raise InputError("--features and --preset are two pieces of work; run it twice")
 
 
 @contextmanager
@@ -121,8 +124,7 @@ def _dump(device: Device, out: Path) -> dict[str, Any]:
         "values": dict(dump.values),
         "unread": dict(dump.unread),
     }
-    with replacing(out) as partial:
-        partial.write_text(json.dumps(document, indent=1, default=str) + "\n", encoding="utf-8")
+    write_json(out, document)
     report: dict[str, Any] = {
         "features": str(out), "read": len(dump.values), "unread": len(dump.unread),
     }  # fmt: skip
@@ -137,16 +139,18 @@ def _dump(device: Device, out: Path) -> dict[str, Any]:
 def _write_preset(device: Device, path: Path) -> dict[str, Any]:
     preset = read_preset(path)
     differences = apply_preset(_featured(device), preset)
-    if differences:
-        lines = "\n".join(f"  - {difference}" for difference in differences)
+    wrong = [difference for difference in differences if not difference.slight]
+    if wrong:
+        lines = "\n".join(f"  - {difference}" for difference in wrong)
         raise WorkError(
-            f"{device.info.serial}: {len(differences)} setting(s) of {path} do not read back as "
+            f"{device.info.serial}: {len(wrong)} setting(s) of {path} do not read back as "
             f"asked\n{lines}"
         )
     info = device.info
     return {
         "device": info.serial, "preset": preset.name, "written": len(preset.writes),
         "layout": f"{info.layout.width} x {info.layout.height} px, {info.layout.dtype}",
+        "rounded": "; ".join(str(one) for one in differences) or "none",
     }  # fmt: skip
 
 

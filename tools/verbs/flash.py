@@ -43,5 +43,9 @@ def run(arguments: Arguments, progress: Progress) -> dict[str, Any]:
         "colour": str(worst(found)),
         "same trigger everywhere": worst(found) == Colour.GREEN,
         "findings": [f"{one.sentence} {one.remedy}".strip() for one in found],
-        "frames": {name: flash_of(series).index for name, series in levels.items()},
+        "frames": {name: _frame(flash_of(series).index) for name, series in levels.items()},
     }
+
+
+def _frame(index: int) -> int | None:
+    return index if index >= 0 else None

@@ -13,13 +13,17 @@ from typing import Any
 
 import tyro
 
+from capture.checksums import CHECKSUMS
 from capture.durable import FolderLock
 from capture.errors import TakeError, WorkError
+from capture.opening import OPENING
 from capture.progress import Progress
 from capture.session import Session
 from capture.take import MANIFEST, Take
 from capture.verify import VerifyReport, VerifySettings, verify_take
 from tools.verbs.options import Options
+
+_OF_A_TAKE = (MANIFEST, CHECKSUMS, OPENING, "frames")  # a take that lost one of them is damaged
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,19 +52,19 @@ def _verify_session(folder: Path, progress: Progress) -> dict[str, Any]:
     Session.open(folder)
     takes: list[dict[str, Any]] = []
     problems: list[str] = []
-    for place in sorted(path for path in (folder / "takes").iterdir() if path.is_dir()):
+    for place in sorted(path for path in (folder / "takes").glob("*") if path.is_dir()):
         if place.name.startswith("."):
             continue
         if place.suffix == ".partial":
             said = _unfinished(place, problems)
-        elif (place / MANIFEST).is_file():
+        elif any((place / name).exists() for name in _OF_A_TAKE):
             try:
                 found = _verify(place, progress)
             except TakeError as error:
                 found = VerifyReport(0, {}, (str(error),))
             problems += [f"{place.name}: {problem}" for problem in found.problems]
             takes.append({"take": place.name, **_figures(found)})
-            said = "sound" if found.sound else f"{len(found.problems)} problems"
+            said = "sound" if found.sound else _counted(found.problems)
             said = f"{said}, {found.frames} frames"
         else:
             continue
@@ -90,4 +94,8 @@ def _figures(found: VerifyReport) -> dict[str, Any]:
 
 def _listed(problems: tuple[str, ...] | list[str]) -> str:
     lines = "\n".join(f"  - {problem}" for problem in problems)
-    return f"{len(problems)} problem{'s' if len(problems) > 1 else ''}\n{lines}"
+    return f"{_counted(problems)}\n{lines}"
+
+
+def _counted(problems: tuple[str, ...] | list[str]) -> str:
+    return f"{len(problems)} problem{'s' if len(problems) > 1 else ''}"

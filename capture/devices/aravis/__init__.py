@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from capture.devices.aravis import finding
 from capture.devices.aravis.device import AravisDevice
-from capture.devices.aravis.network import host_problems
 from capture.devices.aravis.parts import open_device
 from capture.devices.backend import FoundDevice
 
-__all__ = ["AravisBackend", "AravisDevice", "backend", "host_problems"]
+__all__ = ["AravisBackend", "AravisDevice", "backend"]
 
 
 class AravisBackend:

@@ -13,10 +13,8 @@ from capture.devices.aravis.handle import Handle
 from capture.devices.aravis.library import aravis, translated
 from capture.devices.aravis.network import (
     ORDINARY_PACKET,
-    host_problems,
     interface_of,
     packet_pause_ns,
-    packet_problems,
 )
 from capture.devices.aravis.triggers import Triggers
 from capture.devices.protocol import DeviceInfo
@@ -80,11 +78,8 @@ class Connection:
 
     @property
     def problems(self) -> tuple[str, ...]:
-        """What may lose frames, in words."""
-        if not self.gige:
-            return (*self._notes, *self.triggers.problems)
-        packets = packet_problems(self._packet_bytes, self._mtu()) if self._packet_bytes else ()
-        return (*self._notes, *self.triggers.problems, *packets, *host_problems())
+        """What may lose frames, in words; host and packets are the preflight's."""
+        return (*self._notes, *self.triggers.problems)
 
     def describe(self, name: str) -> DeviceInfo:
         """What the device is, as it is set now."""

@@ -58,7 +58,7 @@ class AravisDevice:
 
     @property
     def problems(self) -> tuple[str, ...]:
-        """What may lose frames, in words: short packets, small buffers of the host."""
+        """What was changed when it was opened, and why it may miss triggers, in words."""
         return self._connection.problems
 
     @property

@@ -42,10 +42,11 @@ def check_format(name: str, asked: str, offered: Sequence[str]) -> None:
     offers = f"offers {', '.join(offered) or 'none'}"
     if asked in offered:
         offers = "which is packed or coloured and not unpacked here"
-    advice = f'set PixelFormat = "{fit[0]}"' if fit else "none that it offers can be taken"
-    if len(fit) > 1:
-        advice += f" or {', '.join(fit[1:])}"
-    raise DeviceError(f"{name}: asked for {asked}, {offers}; {advice} in its preset")
+    advice = "none that it offers can be taken"
+    if fit:
+        others = f" or {', '.join(fit[1:])}" if fit[1:] else ""
+        advice = f'set PixelFormat = "{fit[0]}"{others} in its preset'
+    raise DeviceError(f"{name}: asked for {asked}, {offers}; {advice}")
 
 
 def layout_of(pixel_format: str, width: int, height: int) -> ImageLayout:

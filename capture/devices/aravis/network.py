@@ -1,4 +1,4 @@
-"""What the host's network says: in whose reach an address lies, and what would slow it down."""
+"""What the host's network says: in whose reach an address lies, and how packets are paced."""
 
 from __future__ import annotations
 
@@ -7,10 +7,8 @@ import ipaddress
 import socket
 import struct
 from dataclasses import dataclass
-from pathlib import Path
 
 _ADDRESS, _MASK, _MTU = 0x8915, 0x891B, 0x8921  # SIOCGIFADDR, SIOCGIFNETMASK, SIOCGIFMTU
-_RECEIVE_LIMIT = Path("/proc/sys/net/core/rmem_max")
 ENOUGH_RECEIVE_BYTES = 10_000_000
 ORDINARY_PACKET = 1500
 _HEADERS, _WIRE = 36, 38  # bytes: IP, UDP and GVSP inside a packet; Ethernet around it
@@ -61,35 +59,6 @@ def address_problems(address: str) -> tuple[str, ...]:
     return (
         f"its address {address} is in no network of this host ({ours}); "
         f"give it an address of one of these, or the host one of its",
-    )
-
-
-def host_problems() -> tuple[str, ...]:
-    """What of the host's settings loses packets at high rates, in words."""
-    try:
-        limit = int(_RECEIVE_LIMIT.read_text(encoding="ascii"))
-    except (OSError, ValueError):
-        return ()
-    if limit >= ENOUGH_RECEIVE_BYTES:
-        return ()
-    return (
-        f"the host buffers at most {limit / 1e6:.1f} MB of packets (net.core.rmem_max); "
-        f"run: sudo sysctl -w net.core.rmem_max={ENOUGH_RECEIVE_BYTES}",
-    )
-
-
-def packet_problems(packet_bytes: int, mtu: int) -> tuple[str, ...]:
-    """What is wrong with a packet size that was read back from a device, in words."""
-    if packet_bytes > ORDINARY_PACKET:
-        return ()
-    if mtu > ORDINARY_PACKET:
-        return (
-            f"packets of {packet_bytes} bytes although the host takes {mtu}: "
-            f"check the switch, and the device's limit",
-        )
-    return (
-        f"packets of {packet_bytes} bytes cost the host six times the work of 9000; "
-        f"set MTU 9000 on the host's interface, the switch and the device",
     )
 
 

@@ -15,6 +15,7 @@ from capture.devices.watchdog import Watchdog
 from capture.errors import DeviceError
 
 _OPEN_S = 15.0
+_PARTING_S = 2.0
 # Names since 2015, and before. The old clock counts ticks of its own, the new one nanoseconds.
 _LATCHES = (
     ("TimestampLatch", "TimestampLatchValue"),
@@ -101,8 +102,13 @@ def open_device(asked: str, name: str) -> AravisDevice:
     control = Watchdog(name)
     try:
         connection = control.call(lambda: Connection(name, asked), _OPEN_S)
-        kind = control.call(lambda: _kind(connection), _OPEN_S)
-        return kind(name, connection, control)
+        try:
+            kind = control.call(lambda: _kind(connection), _OPEN_S)
+            return kind(name, connection, control)
+        except DeviceError:
+            # Said, not left to the last hold: whoever keeps the error would keep the device.
+            control.post(connection.drop).wait(_PARTING_S)
+            raise
     except DeviceError:
         control.close()
         raise

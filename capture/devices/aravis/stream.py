@@ -163,7 +163,7 @@ class FrameStream:
             stream.set_property("frame-retention", plan.retention_us)
             # Aravis asks after 20 ms of silence, when a frame at 75 Hz is about to be given up.
             stream.set_property("packet-timeout", plan.retention_us // 8)
-            # Room for several frames, as far as the host allows: see `network.host_problems`.
+            # Room for several frames, as far as the host allows: the preflight looks at that.
             stream.set_property("socket-buffer", library.GvStreamSocketBuffer.FIXED)
             stream.set_property("socket-buffer-size", ENOUGH_RECEIVE_BYTES)
         device = camera.get_device()

@@ -141,7 +141,8 @@ class Triggers:
         if 0 < most < rate_hz * (1 - _RATE_SLACK):
             self.problems = (
                 f"triggers come at {rate_hz:g} Hz, and with its present exposure and image size "
-                f"it takes {most:.4g} Hz: it will miss some",
+                f"it takes {most:.4g} Hz, so it will miss some; shorten the exposure, make the "
+                f"image smaller, or lower the rate",
             )
 
     def _source(self, spec: TriggerSpec) -> str:

@@ -1,7 +1,9 @@
 """What devices see that are simulated in real time: a pattern that proves which frame it is.
 
-Pixel (x, y) of channel c in the frame numbered `id` is (x + y + c + id) mod 255. Over the first 32
-bytes stands a `Stamp`: which device, which exposure, which number, and when, truly.
+Pixel (x, y) of channel c in the frame numbered `id` is (118 x + 43 y + c + 43 id) mod 251. Over the
+first 32 bytes stands a `Stamp`: which device, which exposure, which number, and when, truly. Grey
+values are spread evenly over every part of an image, so that a preflight sees a steady light, and
+none is white.
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ STAMP_BYTES = 32
 
 _STAMP = struct.Struct("<4sIqqq")
 _MARK = b"SIM1"
-_MODULUS = 255
+_ACROSS, _DOWN, _MODULUS = 118, 43, 251
 
 
 @dataclass(frozen=True)
@@ -97,6 +99,6 @@ class PatternWriter:
 @functools.lru_cache(maxsize=8)
 def _strip(layout: ImageLayout) -> Image:
     """The rows of all images, as bytes; each image begins somewhere in it."""
-    row = np.arange(layout.width)[:, None] + np.arange(layout.channels)
-    rows = np.arange(layout.height + _MODULUS)[:, None, None] + row
+    row = _ACROSS * np.arange(layout.width)[:, None] + np.arange(layout.channels)
+    rows = _DOWN * np.arange(layout.height + _MODULUS)[:, None, None] + row
     return (rows % _MODULUS).astype(layout.dtype).reshape(-1).view(np.uint8)

@@ -252,11 +252,11 @@ class V4l2Device:
             self._lost = self._lost or "closed"
 
     def _begin(self) -> None:
+        fill = filler(self._pix, self._slots())  # first: it is refused without a decoder
         buffers = DriverBuffers(self._node, _DRIVER_BUFFERS)
         buffers.start()
         with self._lock:
-            self._fill = filler(self._pix, self._slots())
-            self._buffers, self._lost = buffers, ""
+            self._fill, self._buffers, self._lost = fill, buffers, ""
 
     def _arrived(self) -> list[FrameEvent]:
         """Frames whose slots are filled, those first that came before the device was lost."""

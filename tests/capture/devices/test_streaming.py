@@ -64,7 +64,7 @@ def test_the_pattern_is_the_formula_and_carries_its_stamp(layout: ImageLayout) -
     for index in ((layout.height - 1, 3), (layout.height - 1, layout.width - 1)):
         for c in range(layout.channels):
             found = image[index] if layout.channels == 1 else image[(*index, c)]
-            assert found == (index[1] + index[0] + c + stamp.number) % 255
+            assert found == (118 * index[1] + 43 * (index[0] + stamp.number) + c) % 251
     with pytest.raises(DeviceError, match="expected an image stamped b'SIM1', found"):
         Stamp.read(np.zeros((8, 8), np.uint8))
 
@@ -295,3 +295,13 @@ def test_what_cannot_be_is_refused() -> None:
         device.release(event)
     with pytest.raises(DeviceError, match="a generator needs a period above 0"):
         RealTimeLine(0)
+
+
+def test_what_devices_refuse_is_told_with_the_name_of_each_once() -> None:
+    array = streaming_array(2, SMALL)
+    with pytest.raises(DeviceError) as caught:
+        array.each("not started", lambda device: device.acquire.start())
+    assert str(caught.value) == (
+        "2 of 2 devices not started:\n  - cam00: started before it was prepared\n"
+        "  - cam01: started before it was prepared"
+    )

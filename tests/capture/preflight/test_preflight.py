@@ -20,7 +20,13 @@ from capture.frame_header import ImageLayout
 from capture.judgement import Colour
 from capture.live import LiveArray
 from capture.preflight import Finding, PreflightSettings, Subject, preflight, worst
-from capture.preflight.array_checks import burst_findings, odd_settings, roster_findings
+from capture.preflight.array_checks import (
+    burst_findings,
+    cautions,
+    odd_settings,
+    preset_findings,
+    roster_findings,
+)
 from capture.preflight.look import Sight
 from capture.preflight.run import session_exposure
 from capture.recorder import RecordSettings
@@ -83,7 +89,7 @@ def test_everything_speaks_and_nothing_stops_anything(tmp_path: Path) -> None:
     assert checks["roster"][0].colour == Colour.RED
     assert worst(checks["ptp"]) == worst(checks["calibration"]) == worst(checks["link"]) == "green"
     assert len(checks["scene"]) == 3
-    assert told[-1][0] == 14
+    assert told[-1] == (15, "preflight")
     assert (session / "start_levels.json").is_file()
 
 
@@ -157,6 +163,35 @@ def test_odd_settings_are_named() -> None:
     devices[1].write_feature("Gain", 5.0)  # type: ignore[attr-defined]
     devices[0].write_feature("Gain", 5.0)  # type: ignore[attr-defined]
     assert odd_settings(devices) == [], "no value is usual"
+    for device, gain in zip(devices, (20.0, 20.1, 20.2, 3.0), strict=True):
+        device.write_feature("Gain", gain)  # type: ignore[attr-defined]
+    (finding,) = odd_settings(devices)
+    assert finding.device == "cam03", "what is rounded to other steps is not odd"
+
+
+class Worried(StreamingDevice):
+    """A device that knows of something."""
+
+    problems = ("triggers come too fast; lower the rate", "its fan stands still")
+
+
+def test_what_a_device_says_of_itself_is_told_with_its_remedy() -> None:
+    devices = streaming_array(2, LAYOUT).devices
+    assert cautions(devices) == []
+    devices[1].__class__ = Worried
+    assert [(one.device, one.colour, one.sentence, one.remedy) for one in cautions(devices)] == [
+        ("cam01", Colour.AMBER, "cam01 says: triggers come too fast.", "lower the rate"),
+        ("cam01", Colour.AMBER, "cam01 says: its fan stands still.", ""),
+    ]
+
+
+def test_a_preset_that_does_not_hold_names_its_device_once() -> None:
+    devices = streaming_array(1, LAYOUT).devices
+    (finding,) = preset_findings(devices, {"cam00": Preset("day", (("Gian", 3.0),))})
+    assert finding.sentence == (
+        "cam00 is not set as preset day says: Gian: asked for 3.0, reads nothing "
+        "(no feature 'Gian'; did you mean 'Gain'?)."
+    )
 
 
 def test_a_roster_that_is_whole_is_green() -> None:

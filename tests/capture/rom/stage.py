@@ -14,6 +14,7 @@ from capture.errors import LikenessError
 from capture.frame_header import ImageLayout
 from capture.live import LiveArray
 from capture.preflight.finding import Finding
+from capture.progress import Progress
 from capture.recorder import RecordSettings
 from capture.rom.conductor import Conductor, Stand
 from capture.rom.events import Key
@@ -66,17 +67,19 @@ class Rehearsal:
 
     def conductor(self) -> Conductor:
         """A conductor that takes up the session."""
-        return Conductor(
-            Stand(
-                session=Session.create(self.folder),
-                prompts=self.prompts,
-                array=self.live,
-                settings=SETTINGS,
-                frame_set_bytes=self.devices * LAYOUT.nbytes,
-                preflight=self._preflight,
-                keep_green=self.keep_green,
-                reserve_bytes=self.reserve_bytes,
-            )
+        return Conductor(self.stand())
+
+    def stand(self) -> Stand:
+        """What it stands on."""
+        return Stand(
+            session=Session.create(self.folder),
+            prompts=self.prompts,
+            array=self.live,
+            settings=SETTINGS,
+            frame_set_bytes=self.devices * LAYOUT.nbytes,
+            preflight=self._preflight,
+            keep_green=self.keep_green,
+            reserve_bytes=self.reserve_bytes,
         )
 
     def spoil(self, kind: FaultKind, device: int = 0, triggers: int = 1) -> None:
@@ -85,7 +88,8 @@ class Rehearsal:
         assert isinstance(found, StreamingDevice)
         found.inject(Fault(kind, triggers=triggers))
 
-    def _preflight(self) -> Sequence[Finding]:
+    def _preflight(self, heard: Progress) -> Sequence[Finding]:
+        heard(0, 1, "preflight: rehearsal")
         if self.fails:
             raise LikenessError(self.fails)
         assert len(self.live.latest()) == self.devices, "the array streams before it is checked"

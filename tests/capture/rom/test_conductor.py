@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import threading
 import time
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 from capture.devices.faults import FaultKind
@@ -12,6 +14,8 @@ from capture.event_log import read_events
 from capture.judgement import Colour
 from capture.live_take import TakePhase
 from capture.preflight.finding import Finding
+from capture.progress import Progress
+from capture.rom.conductor import Conductor
 from capture.rom.events import Key
 from capture.rom.state import Stage
 from capture.rom.view import Cue, View
@@ -258,3 +262,28 @@ def test_leaving_while_a_take_is_recorded_keeps_it(tmp_path: Path) -> None:
     with Rehearsal(tmp_path / "s").conductor() as conductor:
         [kept] = conductor.view().takes
         assert kept.phase == TakePhase.DONE
+
+
+def test_leaving_while_the_array_is_checked_waits_for_no_check_to_end(tmp_path: Path) -> None:
+    rehearsal = Rehearsal(tmp_path)
+    begun = threading.Event()
+    ended: list[str] = []
+
+    def endless(heard: Progress) -> tuple[Finding, ...]:
+        begun.set()
+        try:
+            while True:
+                heard(3, 14, "preflight: ptp")
+                time.sleep(0.005)
+        finally:
+            ended.append("by its progress")
+
+    stand = replace(rehearsal.stand(), preflight=endless)
+    with Conductor(stand) as conductor:
+        assert conductor.key(Key.ARM) == ""
+        assert begun.wait(10)
+        until(conductor, lambda view: "ptp (3 of 14)" in view.headline)
+        assert conductor.key(Key.DISARM) == ""
+        assert conductor.key(Key.ARM) == ""  # a check of its own
+        until(conductor, lambda view: "ptp (3 of 14)" in view.headline)
+    assert ended == ["by its progress"] * 2

@@ -235,6 +235,10 @@ def test_stop_closes_the_take_once_and_stays_at_its_prompt() -> None:
     assert press(step.state, Key.STOP, 4.1).refusal == "neutral_001 is being closed already."
     state = written(judged(step.state, "neutral_001"), "neutral_001")
     assert (state.stage, state.place) == (Stage.ARMED, 0)
+    # Its hold may be missing: it is green by what there is, and nobody has said that it is enough.
+    done = after(state, TakeChecked(at_s=9, take="neutral_001"))
+    assert [take.name for take in done.undecided] == ["neutral_001"]
+    assert press(done, Key.KEEP).state.takes[0].status == TakeStatus.KEEP
 
 
 def test_a_take_that_does_not_end_is_closed_and_at_last_given_up() -> None:

@@ -104,6 +104,16 @@ def test_a_folder_that_a_crash_left_is_told_though_nothing_was_written_down(
     )
 
 
+def test_a_take_that_cannot_be_read_is_told_and_the_session_goes_on(tmp_path: Path) -> None:
+    session = session_of(tmp_path, armed())
+    (session.folder / "takes" / "smile_001").mkdir()
+    (session.folder / "takes" / "smile_001" / "take.json").write_text("{")
+    loaded, told = load_state(session, prompts())
+    assert loaded.takes == ()
+    assert told[-1].startswith("A take cannot be read: ")
+    assert "smile_001/take.json: not readable as JSON" in told[-1]
+
+
 def test_takes_on_disk_that_nobody_knows_are_taken_up(tmp_path: Path) -> None:
     with Rehearsal(tmp_path / "s").conductor() as conductor:
         arm(conductor)

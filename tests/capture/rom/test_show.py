@@ -16,6 +16,7 @@ from tests.capture.rom.situations import MACHINE, after, armed, judged, press, r
 def view(state: RomState, at_s: float = 0.0) -> View:
     return draw(
         Sight(
+            checking="sync (10 of 14)",
             at_s=at_s,
             session="monday",
             machine=MACHINE,
@@ -27,6 +28,13 @@ def view(state: RomState, at_s: float = 0.0) -> View:
             findings=(),
             messages=(),
         )
+    )
+
+
+def test_a_check_says_how_far_it_is() -> None:
+    checking = press(RomState(), Key.ARM).state
+    assert view(checking).headline == (
+        "The devices are being started and checked: sync (10 of 14)."
     )
 
 

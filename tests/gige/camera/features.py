@@ -143,6 +143,7 @@ def _image(setup: Setup) -> list[Feature]:
     group = "ImageFormatControl"
     width, height = setup.width, setup.height
     fixed = {"writable": False}
+    formats = {"Mono12p": 0x010C0047} if setup.packed else {n: c for n, (c, _) in FORMATS.items()}
     return [
         _number("SensorWidth", group, default=width, **fixed),
         _number("SensorHeight", group, default=height, **fixed),
@@ -152,7 +153,7 @@ def _image(setup: Setup) -> list[Feature]:
         _number("Height", group, default=height, low=8, high=height, step=8, held=True),
         _number("OffsetX", group, default=0, high=0, held=True),
         _number("OffsetY", group, default=0, high=0, held=True),
-        _choice("PixelFormat", group, {n: code for n, (code, _) in FORMATS.items()}, held=True),
+        _choice("PixelFormat", group, formats, held=True),
     ]
 
 

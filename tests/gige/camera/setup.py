@@ -29,6 +29,7 @@ class Setup:
         path_mtu: larger test packets are lost on the way.
         readout_us: after an exposure, before the next trigger is answered.
         temperature_c: what it says of itself.
+        packed: whether it offers no format but one that packs pixels.
     """
 
     address: str
@@ -46,6 +47,7 @@ class Setup:
     path_mtu: int = 9000
     readout_us: float = 0.0
     temperature_c: float = 41.5
+    packed: bool = False
 
     def to_json(self) -> str:
         """As one line."""

@@ -80,6 +80,19 @@ def test_the_list_stays_around_the_chosen_take() -> None:
         assert all(len(line) <= 60 for line in lines)
 
 
+def test_the_chosen_take_says_in_full_why_it_is_red() -> None:
+    why = "The program ended before it was written and read back; run `likeness recover`."
+    red = replace(armed().takes[0], colour=Colour.RED, sentence=why)
+    others = tuple(replace(red, name=f"jaw_{n:03d}", colour=Colour.GREEN) for n in range(1, 9))
+    view = replace(armed(), takes=(*others, replace(red, name="smile_009")))
+    lines = cards.take_list(view, "smile_009", 40, 5).plain.split("\n")
+    assert len(lines) == 5
+    assert why in " ".join(line.strip() for line in lines)
+    assert lines[-1].startswith(" jaw_00")
+    last = cards.take_list(view, "smile_009", 40, 1).plain
+    assert last.startswith(">smile_009 RED")
+
+
 def test_messages_name_devices_in_trouble_first_and_findings_with_remedies() -> None:
     view = replace(armed(), stage=Stage.PREFLIGHT)
     lines = cards.message_lines(view, 80, 10).plain.split("\n")

@@ -62,7 +62,7 @@ class Room:
             Stand(
                 session=self.session, prompts=PROMPTS, array=self.live, settings=settings,
                 frame_set_bytes=3 * 64 * 48, reserve_bytes=0,
-                preflight=lambda: self.findings,
+                preflight=lambda _: self.findings,
             )
         )  # fmt: skip
 

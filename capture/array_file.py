@@ -192,9 +192,9 @@ def simulated_array_file(count: int, *, size_px: int = 256, rate_hz: float = 25.
         )
         for number in range(1, count + 1)
     )
-    return ArrayFile(
-        name="simulated", devices=devices, ptp=True, record=RecordSettings(rate_hz=rate_hz)
-    )
+    roll = round(rate_hz / 2)  # half a second before the key and after the end
+    record = RecordSettings(rate_hz=rate_hz, pre_roll=roll, post_roll=roll)
+    return ArrayFile(name="simulated", devices=devices, ptp=True, record=record)
 
 
 def _devices(found: Any, folder: Path, problems: list[str]) -> tuple[ArrayDevice, ...]:

@@ -194,6 +194,15 @@ class Collator:
         if slips:
             self.slip_ns = round(median(slips))
 
+    def parted(self) -> float:
+        """How many periods devices that run free have parted since their first frames."""
+        slips = [
+            min(track.lags_ns) - track.first_lag_ns
+            for track in self._tracks.values()
+            if track.first_lag_ns is not None and track.lags_ns
+        ]
+        return (max(slips) - min(slips)) / self.train.period_ns if slips else 0.0
+
     def train_from(self, trigger_index: int) -> TriggerTrain:
         """The train as it runs by now, counted from one of its triggers."""
         return TriggerTrain(self.train.time_ns(trigger_index) + self.slip_ns, self.train.period_ns)

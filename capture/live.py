@@ -131,7 +131,7 @@ class LiveArray:
         count = self.settings.pre_roll + shot.frames + self.settings.post_roll
         number = self._next_number(session, shot.slate)
         folder = session.folder / "takes" / f"{shot.slate}_{number:03d}"
-        first = max(stream.next_index - self.settings.pre_roll, 0)
+        first = max(stream.next_index - self.settings.pre_roll, stream.first_index)
         opening = opening_of(shot, number, self.settings, stream.train_from(first))
         take = LiveTake(shot, number, folder, opening)
         take.begin(stream, lanes, first, count)

@@ -14,13 +14,13 @@ import threading
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from capture.arrays import Image
 from capture.collate import Collator, TriggerTrain
 from capture.devices.array import DeviceArray
 from capture.devices.capabilities import Latching
-from capture.devices.protocol import ClockSample, Device
+from capture.devices.protocol import ClockSample, Device, TriggerKind
 from capture.errors import DeviceError
 from capture.frame import FrameEvent
 from capture.frame_header import FrameHeader
@@ -34,6 +34,7 @@ _LOOK_S = 1.0  # how long triggers that others send are looked for before silent
 _LOOK_FRAMES = 4  # of each device that are asked for meanwhile: the first one is often late
 _FORGET_EVERY = 256
 _FOLLOW_NS = 500_000_000
+_PARTED = 0.6  # periods
 
 
 @dataclass
@@ -63,6 +64,7 @@ class Stream:
         settings: rate, exposure, waiting time.
         counts: by device name, what came of it.
         pumped_ns: when it was last looked what has arrived, by the host's clock.
+        first_index: the first trigger since devices were numbered anew; no take begins before it.
     """
 
     def __init__(self, array: DeviceArray, settings: RecordSettings, ring_frames: int = 0) -> None:
@@ -80,6 +82,8 @@ class Stream:
         self._rings: list[deque[HeldFrame]] = [deque() for _ in array.devices]
         self._places = {name: place for place, name in enumerate(array.names)}
         self._clocks = StreamClocks(array, settings)
+        self.first_index = 0
+        self._looking = True
         self._early: list[FrameEvent] = []  # before the triggers of others were made out
         self._anew: set[str] = set()  # found again, not yet heard
         self._collator: Collator | None = None
@@ -167,18 +171,18 @@ class Stream:
             # Before polling: what arrives while this is slow has not been looked for yet.
             now = self.array.line.now_ns()
             arrived = [event for device in self.array.devices for event in self._poll(device)]
-            if self._collator is None:
+            if self._looking:
                 self._early += arrived
                 arrived = self._look()
-            if self._collator is not None:
+            if self._collator is not None and not self._looking:
                 self._deliver(self._collator, arrived)
-                if not self.array.line.fires and now >= self._follow_ns:
-                    self._collator.follow()
-                    self._follow_ns = now + _FOLLOW_NS
                 for window in list(self._windows):
                     if self._over(self._collator, window, now):
                         self._close(window)
                 self._forget(self._collator)
+                if not self.array.line.fires and now >= self._follow_ns:
+                    self._follow_ns = now + _FOLLOW_NS
+                    self._follow(self._collator, now)
             self.pumped_ns = now
 
     def open(self, first: int, count: int, deliver: Deliver) -> Window:
@@ -296,6 +300,16 @@ class Stream:
             now_ns >= collator.train_from(last).start_ns + round(wait_ns) and last < self.next_index
         )
 
+    def _follow(self, collator: Collator, now_ns: int) -> None:
+        """Follow what is not ours to fire; between takes, number devices that parted anew.
+
+        Devices that run free have each their own pace: 40 millionths make eleven frames an hour.
+        """
+        collator.follow()
+        free = self.array.trigger == TriggerKind.FREE_RUN
+        if free and not self._windows and collator.parted() > _PARTED:
+            self._looking, self._started_ns = True, now_ns
+
     def _look(self) -> list[FrameEvent]:
         """Make out triggers that others send; the frames so far once that is done."""
         heard = Counter(event.device for event in self._early)
@@ -304,12 +318,16 @@ class Stream:
         if not heard or (few and waited < 1e9 * _LOOK_S):
             return []
         early, self._early = self._early, []
-        self._begin(*self._clocks.make_out(early))
+        train, phases = self._clocks.make_out(early)
+        # Numbers go on: what was exposed before keeps its own.
+        self.first_index = max(count.last_index for count in self.counts.values()) + 1
+        self._begin(replace(train, start_ns=train.time_ns(-self.first_index)), phases)
         return early
 
     def _begin(self, train: TriggerTrain, phases: Mapping[str, int]) -> None:
         clocks = self._clocks.begin(phases)
         self._collator = Collator([device.info for device in self.array.devices], train, clocks)
+        self._looking = False
 
     def _close(self, window: Window) -> None:
         self._windows.remove(window)

@@ -69,7 +69,7 @@ class StreamClocks:
             own = [event for event in events if event.device == name]
             if self._kinds[name] == ClockKind.HOST:
                 self._models[name] = ClockModel(0, 0)
-            elif name not in self._models:
+            elif name not in self._readings:
                 late_ns = round(1e3 * self._settings.exposure_us)
                 self._models[name] = model_of_arrivals(
                     [event.t_dev_ns for event in own],

@@ -321,6 +321,40 @@ def test_triggers_of_a_generator_are_made_out_and_no_frame_is_misplaced(seed: in
         assert abs(found - round(found / period) * period) < 2_000_000, frame
 
 
+@pytest.mark.parametrize("clock", [ClockKind.HOST, ClockKind.OWN])
+def test_devices_that_run_free_at_their_own_pace_are_numbered_anew_between_takes(
+    clock: ClockKind,
+) -> None:
+    paces = (1.0, 1.0003, 0.9998, 1.00005)
+    lines = [OutsideLine(5_000_000_000 + PERIOD * k // 5, round(PERIOD * pace))
+             for k, pace in enumerate(paces)]  # fmt: skip
+    devices = tuple(
+        SimulatedDevice(camera, StampScene(), line, SimulatedSettings())
+        for camera, line in zip(cameras(4), lines, strict=True)
+    )
+    for device in devices:
+        device.info = replace(device.info, triggers=(TriggerKind.FREE_RUN,), clock=clock)
+    stream = Stream(DeviceArray(devices, SeveralLines(lines), TriggerKind.FREE_RUN), SETTINGS, 4)
+    stream.start()
+    newest = -1
+    for _ in range(6):
+        run(stream, 30)  # the fastest and the slowest part by more than a period
+        first = max(stream.next_index - 4, stream.first_index)
+        window = stream.open(first, 40, lambda frame: frame.done())
+        run(stream, 1)
+        assert window.recording is not None
+        ledger = window.recording.ledger
+        assert ledger.counts()[Verdict.OK] == 160
+        assert ledger.remarks == ()
+        for k in range(40):
+            times = [ledger.entry(k, name).t_host_ns for name in ledger.devices]
+            assert max(times) - min(times) < 2 * PERIOD
+        assert window.first > newest
+        newest = window.last
+    assert stream.first_index > 0
+    assert all(count.last_index < 6 * 31 * 76 for count in stream.counts.values())
+
+
 def test_devices_that_run_free_keep_their_phase_and_show_their_spread() -> None:
     lines = [OutsideLine(5_000_000_000 + PERIOD * k // 4, PERIOD) for k in range(4)]
     devices = tuple(

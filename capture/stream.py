@@ -169,7 +169,7 @@ class Stream:
         """Place all that has arrived, hand it to open windows, close those that are over."""
         with self._lock:
             # Before polling: what arrives while this is slow has not been looked for yet.
-            now = self.array.line.now_ns()
+            now, sent = self.array.line.now_ns(), self.next_index
             arrived = [event for device in self.array.devices for event in self._poll(device)]
             if self._looking:
                 self._early += arrived
@@ -177,7 +177,7 @@ class Stream:
             if self._collator is not None and not self._looking:
                 self._deliver(self._collator, arrived)
                 for window in list(self._windows):
-                    if self._over(self._collator, window, now):
+                    if self._over(self._collator, window, now, sent):
                         self._close(window)
                 self._forget(self._collator)
                 if not self.array.line.fires and now >= self._follow_ns:
@@ -290,15 +290,19 @@ class Stream:
                 ring.popleft().done()
             frame.done()
 
-    def _over(self, collator: Collator, window: Window, now_ns: int) -> bool:
+    def _over(self, collator: Collator, window: Window, now_ns: int, sent: int) -> bool:
         # The edge belongs to it: what comes twice comes after the frame that it repeats.
         last = window.last + self.settings.edge_triggers
         if collator.settled(last):
             return True
-        wait_ns = 1e3 * self.settings.exposure_us + 1e6 * self.settings.retention_ms
-        return (
-            now_ns >= collator.train_from(last).start_ns + round(wait_ns) and last < self.next_index
-        )
+        if last >= sent:
+            return False
+        # A host that stalls sends late: frames are waited for from when the last trigger was seen
+        # to be sent, and what was sent while it looked has not been looked for.
+        if window.sent_ns is None:
+            window.sent_ns = now_ns
+        wait_ns = round(1e3 * self.settings.exposure_us + 1e6 * self.settings.retention_ms)
+        return now_ns >= max(collator.train_from(last).start_ns, window.sent_ns) + wait_ns
 
     def _follow(self, collator: Collator, now_ns: int) -> None:
         """Follow what is not ours to fire; between takes, number devices that parted anew.

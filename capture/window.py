@@ -56,12 +56,14 @@ class Window:
         first: the first trigger, counted in the stream.
         count: how many; `Stream.shorten` may make it fewer.
         closed: set when it is over.
+        sent_ns: when its last trigger was first seen to be sent; None: not yet.
     """
 
     def __init__(self, first: int, count: int, deliver: Deliver) -> None:
         """Describe a window; `Stream.open` opens it."""
         self.first, self.count, self.deliver = first, count, deliver
         self.closed = threading.Event()
+        self.sent_ns: int | None = None
         self._lock = threading.Lock()
         self._make: Callable[[], Recording] | None = None
         self._recording: Recording | None = None

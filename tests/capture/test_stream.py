@@ -210,6 +210,36 @@ def test_a_silent_device_does_not_keep_a_window_open() -> None:
     assert verdicts(window.recording.ledger, "cam00") == {}
 
 
+def test_triggers_that_a_stalled_host_sends_late_are_waited_for() -> None:
+    array = array_of(2)
+    stream = Stream(array, SETTINGS)
+    stream.start()
+    advance(stream, 5)
+    window = stream.open(5, 10, lambda frame: frame.done())
+    # Half a second passes in which nothing is sent; then all that is overdue is sent at once, while
+    # the stream has just looked what has arrived.
+    late_ns = array.line.now_ns() + 500_000_000
+    poll = array.devices[0].poll  # type: ignore[attr-defined]
+
+    def stalled() -> object:
+        array.devices[0].poll = poll  # type: ignore[attr-defined]
+        arrived = poll()
+        for _ in range(10 + 2 * SETTINGS.edge_triggers):
+            stream._fired += 1
+        return arrived
+
+    array.devices[0].poll = stalled  # type: ignore[attr-defined]
+    array.line.wait(late_ns)
+    stream.pump()
+    assert not window.closed.is_set()
+    stream._fired -= 10 + 2 * SETTINGS.edge_triggers
+    advance(stream, 10 + 2 * SETTINGS.edge_triggers)
+    array.line.wait(late_ns + 500_000_000)
+    stream.pump()
+    assert window.recording is not None
+    assert window.recording.ledger.counts()[Verdict.OK] == 20
+
+
 class OutsideLine(SimulatedLine):
     """A generator that nobody asks: an edge every `period_ns` from `begin_ns` on."""
 

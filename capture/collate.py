@@ -186,21 +186,12 @@ class Collator:
         Frames then come later and later by the host's clock, or earlier, in all devices alike. Over
         an hour a hundred millionths make a third of a second.
         """
-        slips = [
-            min(track.lags_ns) - track.first_lag_ns
-            for track in self._tracks.values()
-            if track.first_lag_ns is not None and track.lags_ns
-        ]
-        if slips:
+        if slips := self._slips_ns():
             self.slip_ns = round(median(slips))
 
     def parted(self) -> float:
         """How many periods devices that run free have parted since their first frames."""
-        slips = [
-            min(track.lags_ns) - track.first_lag_ns
-            for track in self._tracks.values()
-            if track.first_lag_ns is not None and track.lags_ns
-        ]
+        slips = self._slips_ns()
         return (max(slips) - min(slips)) / self.train.period_ns if slips else 0.0
 
     def train_from(self, trigger_index: int) -> TriggerTrain:
@@ -264,6 +255,14 @@ class Collator:
             kept = [[k for k in part if k >= before] for part in track.segments]
             track.segments = [part for part in kept[:-1] if part] + kept[-1:]
         self._remarks = [remark for remark in self._remarks if remark.trigger_index >= before]
+
+    def _slips_ns(self) -> list[int]:
+        """Of each device known well enough, how much later its frames come than at first."""
+        return [
+            min(track.lags_ns) - track.first_lag_ns
+            for track in self._tracks.values()
+            if track.first_lag_ns is not None and track.lags_ns
+        ]
 
     def _first(self, track: _Track, event: FrameEvent) -> int:
         period = self.train.period_ns

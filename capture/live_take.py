@@ -21,9 +21,9 @@ from capture.judgement import Colour, Judgement
 from capture.lanes import LaneJob, WriteLanes
 from capture.ledger import Verdict, unwritten
 from capture.recorder import Recording, RecordSettings
-from capture.session import Shot, judge_take, manifest_of
+from capture.session import Shot, judge_take, manifest_of, sync_of
 from capture.stream import Stream
-from capture.sync_report import ptp_changes_told
+from capture.sync_report import SyncReport, ptp_changes_told
 from capture.take import Take
 from capture.take_writer import TakeWriter, partial_folder
 from capture.verify import VerifyReport, VerifySettings, settle, verify_take
@@ -149,7 +149,7 @@ class LiveTake:
             with make() as writer:
                 self._note_features(writer, watch)  # before frames fill the disk
                 self._write_to(writer)
-                self._save(writer, self._drained(), watch)
+                self._save(writer, watch, *self._drained())
                 self.phase = TakePhase.CHECKING
                 # Still locked, so that nobody recovers what is not lost.
                 with checking:
@@ -208,16 +208,17 @@ class LiveTake:
 
         self._lanes.put(self._places[frame.event.device], LaneJob(frame, write, failed))
 
-    def _drained(self) -> Recording:
+    def _drained(self) -> tuple[Recording, SyncReport, Judgement]:
         """What the take was, once all its frames are written or known to be lost."""
         if self._window is None:
             raise DeviceError(f"{self.name}: never begun")
         self._window.closed.wait()
         try:
-            recording = self._window.recording
-            if recording is None:
+            collated = self._window.recording
+            if collated is None:
                 raise DeviceError(f"{self.name}: the array was stopped before its first frame")
-            self._judge(recording)
+            lost = len(self._gone)
+            judged = self._judge(collated)
             self.phase = TakePhase.DRAINING
         finally:
             # Whatever happens: no lane may still write into files that are closed after this.
@@ -225,9 +226,9 @@ class LiveTake:
                 self._change.wait_for(
                     lambda: self._written + len(self._gone) >= len(self._delivered)
                 )
-        return self._judge(recording)
+        return judged if len(self._gone) == lost else self._judge(collated)
 
-    def _judge(self, collated: Recording) -> Recording:
+    def _judge(self, collated: Recording) -> tuple[Recording, SyncReport, Judgement]:
         reasons = {
             (entry.trigger_index, entry.device): "it was no longer in the ring"
             for entry in collated.ledger.entries
@@ -236,25 +237,32 @@ class LiveTake:
         }
         ledger = unwritten(collated.ledger, {**reasons, **self._gone})
         recording = replace(collated, ledger=ledger)
-        self.recording = recording
         history = (
             []
             if self._watch is None
             else self._watch.ptp_since(time.monotonic() - self._began_s + _LOOK_BACK_S)
         )
         told = tuple(ptp_changes_told(history).values())
-        self.judgement = judge_take(recording, self.shot, self._settings, told)
-        return recording
+        sync = sync_of(recording)
+        judgement = judge_take(recording, sync, self.shot, self._settings, told)
+        self.recording, self.judgement = recording, judgement
+        return recording, sync, judgement
 
-    def _save(self, writer: TakeWriter, recording: Recording, watch: DeviceWatch) -> None:
-        verdict = self.judgement or judge_take(recording, self.shot, self._settings)
+    def _save(
+        self,
+        writer: TakeWriter,
+        watch: DeviceWatch,
+        recording: Recording,
+        sync: SyncReport,
+        verdict: Judgement,
+    ) -> None:
         health = watch.health()
         self._note_features(writer, watch)  # of devices that were found again, or answered late
         if self._unnoted:
             verdict = self.judgement = verdict.at_best(Colour.AMBER, f"{self._unnoted}.")
         writer.finish(
             lambda devices: manifest_of(
-                self._opening, self.name, devices, recording, verdict, health
+                self._opening, self.name, devices, recording, sync, verdict, health
             ),
             ledger=recording.ledger,
             hashed=False,

@@ -281,10 +281,13 @@ def record_take(
                 start_ns=shot.start_ns,
                 told=lambda frames: progress(frames, total, label),
             )
-            verdict = judge_take(recording, shot, settings)
+            sync = sync_of(recording)
+            verdict = judge_take(recording, sync, shot, settings)
             opening = opening_of(shot, number, settings, recording.train)
             writer.finish(
-                lambda devices: manifest_of(opening, folder.name, devices, recording, verdict),
+                lambda devices: manifest_of(
+                    opening, folder.name, devices, recording, sync, verdict
+                ),
                 ledger=recording.ledger,
                 hashed=False,
             )
@@ -296,7 +299,11 @@ def record_take(
 
 
 def judge_take(
-    recording: Recording, shot: Shot, settings: RecordSettings, told: Sequence[str] = ()
+    recording: Recording,
+    sync: SyncReport,
+    shot: Shot,
+    settings: RecordSettings,
+    told: Sequence[str] = (),
 ) -> Judgement:
     """The verdict on a take of a shot: of its ledger, made worse by what its times and clocks say.
 
@@ -304,6 +311,7 @@ def judge_take(
 
     Args:
         recording: of the whole take, pre-roll and post-roll included.
+        sync: of `sync_of`.
         shot: what was to be recorded.
         settings: how.
         told: what became of synchronized clocks meanwhile; each makes it amber.
@@ -314,7 +322,6 @@ def judge_take(
         last = min(last, recording.ledger.triggers - 1)
         hold = (first, last) if first <= last else None
     verdict = judge(recording.ledger, hold)
-    sync = sync_of(recording)
     verdict = verdict.at_best(sync.colour, sync.sentence)
     return verdict.at_best(Colour.AMBER, " ".join(told)) if told else verdict
 
@@ -352,6 +359,7 @@ def manifest_of(
     name: str,
     devices: tuple[DeviceEntry, ...],
     recording: Recording,
+    sync: SyncReport,
     verdict: Judgement,
     health: Mapping[str, Health] | None = None,
 ) -> TakeManifest:
@@ -362,7 +370,8 @@ def manifest_of(
         name: of the take.
         devices: what their files hold.
         recording: ledger, train and clocks.
-        verdict: on the ledger.
+        sync: of `sync_of`.
+        verdict: of `judge_take`.
         health: by device name, what it said of itself; logged, never counted on.
     """
     clocks = {
@@ -387,7 +396,7 @@ def manifest_of(
             "judgement": dataclasses.asdict(verdict),
             "verdicts": {str(kind): n for kind, n in recording.ledger.counts().items()},
             "clocks": clocks,
-            "sync": sync_of(recording).document(),
+            "sync": sync.document(),
             "health": {name: dataclasses.asdict(said) for name, said in (health or {}).items()},
         },
     )

@@ -361,6 +361,9 @@ class Stream:
         for ring in self._rings:
             while ring:
                 ring.popleft().done()
+        for event in self._early:
+            self.array.devices[self._places[event.device]].frames.release(event)
+        self._early = []
 
     def _forget(self, collator: Collator) -> None:
         newest = max(count.last_index for count in self.counts.values())

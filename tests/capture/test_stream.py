@@ -297,6 +297,22 @@ def wired(line: OutsideLine, seed: int, count: int = 3) -> tuple[SimulatedDevice
     return tuple(made)
 
 
+def test_frames_of_triggers_that_were_never_made_out_are_given_back() -> None:
+    line = OutsideLine(5_000_000_000, PERIOD)
+    array = DeviceArray(wired(line, 1), line)
+    stream = Stream(array, SETTINGS)
+    stream.start()
+    line.wait(5_000_000_000 + 2 * PERIOD)  # fewer frames than are looked at
+    stream.pump()
+    assert not stream.ready
+    stream.stop()
+    line.wait(5_000_000_000 + 20 * PERIOD)
+    for device in array.devices:  # those that had not arrived were never handed over
+        for event in device.frames.poll():
+            device.frames.release(event)
+    assert unreleased(array) == 0
+
+
 def test_a_window_opens_now_though_the_generator_runs_at_another_pace() -> None:
     line = OutsideLine(5_000_000_000, round(PERIOD * 1.0008))
     stream = Stream(DeviceArray(wired(line, 1), line), SETTINGS)

@@ -301,6 +301,7 @@ def test_frames_of_triggers_that_were_never_made_out_are_given_back() -> None:
     line = OutsideLine(5_000_000_000, PERIOD)
     array = DeviceArray(wired(line, 1), line)
     stream = Stream(array, SETTINGS)
+    line.wait(5_000_000_000 - PERIOD)
     stream.start()
     line.wait(5_000_000_000 + 2 * PERIOD)  # fewer frames than are looked at
     stream.pump()

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Protocol
+from typing import Protocol, Self
 
 from capture.arrays import Image
 from capture.errors import SettingsError
@@ -200,6 +200,25 @@ class Device(Protocol):
 
     def close(self) -> None:
         """Stop, and give the device back; a closed device may be closed again."""
+
+
+class WholeDevice:
+    """A device that is its own trigger, acquire and frames: one object with the methods of all."""
+
+    @property
+    def trigger(self) -> Self:
+        """When it exposes."""
+        return self
+
+    @property
+    def acquire(self) -> Self:
+        """How it is armed."""
+        return self
+
+    @property
+    def frames(self) -> Self:
+        """Where its frames are."""
+        return self
 
 
 class TriggerLine(Protocol):

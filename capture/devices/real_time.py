@@ -20,7 +20,7 @@ from capture.arrays import Image
 from capture.devices.capabilities import Health
 from capture.devices.faults import Exposure, Fault, FaultBook
 from capture.devices.lines import RealTimeLine
-from capture.devices.protocol import ClockSample, DeviceInfo, TriggerKind, TriggerSpec
+from capture.devices.protocol import ClockSample, DeviceInfo, TriggerKind, TriggerSpec, WholeDevice
 from capture.devices.slots import SlotPool
 from capture.errors import DeviceError
 from capture.frame import FrameEvent
@@ -59,7 +59,7 @@ class Source(Protocol):
         """How far the clock is set back by a reboot at the true time `t_ns`."""
 
 
-class RealTimeDevice:
+class RealTimeDevice(WholeDevice):
     """A played device: its own trigger, acquire and frames."""
 
     def __init__(
@@ -87,21 +87,6 @@ class RealTimeDevice:
         self._next_ns = self._wake_ns = _NEVER  # of the next trigger by itself; of the next news
         self._counters = {"overruns": 0, "ignored_triggers": 0}
         line.connect(self)
-
-    @property
-    def trigger(self) -> RealTimeDevice:
-        """When it exposes."""
-        return self
-
-    @property
-    def acquire(self) -> RealTimeDevice:
-        """How it is armed."""
-        return self
-
-    @property
-    def frames(self) -> RealTimeDevice:
-        """Where its frames are."""
-        return self
 
     def prepare(self, spec: TriggerSpec) -> None:
         """Set the device up for a kind of trigger."""

@@ -12,7 +12,7 @@ from capture.devices.aravis.chunks import sends_exposure
 from capture.devices.aravis.connection import Connection
 from capture.devices.aravis.stream import FrameStream, StreamPlan
 from capture.devices.capabilities import FeatureDump, FeatureValue, Health, PtpReading
-from capture.devices.protocol import DeviceInfo, TriggerSpec
+from capture.devices.protocol import DeviceInfo, TriggerSpec, WholeDevice
 from capture.devices.watchdog import Watchdog
 from capture.errors import DeviceError
 from capture.frame import FrameEvent
@@ -26,7 +26,7 @@ _EXPOSURES = ("ExposureTime", "ExposureTimeAbs")
 _TEMPERATURES = ("DeviceTemperature", "TemperatureAbs")
 
 
-class AravisDevice:
+class AravisDevice(WholeDevice):
     """A GigE Vision or USB3 Vision device.
 
     Every control call runs on a thread of the device's own and has a deadline: a device that is
@@ -60,21 +60,6 @@ class AravisDevice:
     def problems(self) -> tuple[str, ...]:
         """What was changed when it was opened, and why it may miss triggers, in words."""
         return self._connection.problems
-
-    @property
-    def trigger(self) -> AravisDevice:
-        """When it exposes."""
-        return self
-
-    @property
-    def acquire(self) -> AravisDevice:
-        """How it is armed."""
-        return self
-
-    @property
-    def frames(self) -> AravisDevice:
-        """Where its frames are."""
-        return self
 
     def prepare(self, spec: TriggerSpec) -> None:
         """Set the device up for a kind of trigger."""

@@ -17,7 +17,7 @@ from capture.arrays import Image
 from capture.camera import Camera, CameraArray
 from capture.devices.array import DeviceArray
 from capture.devices.faults import Exposure, Fault, FaultBook
-from capture.devices.protocol import ClockSample, DeviceInfo, TriggerKind, TriggerSpec
+from capture.devices.protocol import ClockSample, DeviceInfo, TriggerKind, TriggerSpec, WholeDevice
 from capture.devices.simulated.scene import Scene
 from capture.devices.simulated.settings import SimulatedSettings
 from capture.errors import DeviceError, SettingsError
@@ -54,7 +54,7 @@ class SimulatedLine:
             device.edge(t_ns)
 
 
-class SimulatedDevice:
+class SimulatedDevice(WholeDevice):
     """One simulated device. It is its own trigger, acquire and data logic."""
 
     def __init__(
@@ -89,21 +89,6 @@ class SimulatedDevice:
         self._pending: list[tuple[int, int, FrameEvent]] = []
         self._exposed: dict[int, int] = {}  # true time of exposure, by slot
         line.connect(self)
-
-    @property
-    def trigger(self) -> SimulatedDevice:
-        """When it exposes."""
-        return self
-
-    @property
-    def acquire(self) -> SimulatedDevice:
-        """How it is armed."""
-        return self
-
-    @property
-    def frames(self) -> SimulatedDevice:
-        """Where its frames are."""
-        return self
 
     def reserve(self, frames: int) -> None:
         """Nothing to do: a scene renders a frame when it is fetched."""

@@ -13,7 +13,14 @@ from collections.abc import Sequence
 
 from capture.arrays import Image
 from capture.devices.capabilities import FeatureDump, FeatureValue, Health
-from capture.devices.protocol import ClockKind, ClockSample, DeviceInfo, TriggerKind, TriggerSpec
+from capture.devices.protocol import (
+    ClockKind,
+    ClockSample,
+    DeviceInfo,
+    TriggerKind,
+    TriggerSpec,
+    WholeDevice,
+)
 from capture.devices.slots import SlotPool
 from capture.devices.v4l2 import ioctls
 from capture.devices.v4l2.buffers import DriverBuffers, clock_flags
@@ -35,7 +42,7 @@ from capture.frame import FrameEvent
 _DRIVER_BUFFERS = 12  # 160 ms at 75 Hz: as long as the thread that polls may be held up
 
 
-class V4l2Device:
+class V4l2Device(WholeDevice):
     """One device. It is its own trigger, acquire and frame logic.
 
     The kernel knows no command that exposes one frame and no common name for a trigger input, so
@@ -82,21 +89,6 @@ class V4l2Device:
             address=self._node.path,
             link_mbps=self._identity.link_mbps,
         )
-
-    @property
-    def trigger(self) -> V4l2Device:
-        """When it exposes."""
-        return self
-
-    @property
-    def acquire(self) -> V4l2Device:
-        """How it is armed."""
-        return self
-
-    @property
-    def frames(self) -> V4l2Device:
-        """Where its frames are."""
-        return self
 
     def prepare(self, spec: TriggerSpec) -> None:
         """Set the rate, and the exposure time where the device has a control for it.

@@ -10,14 +10,14 @@ from collections.abc import Sequence
 
 from capture.arrays import Image
 from capture.devices.backend import FoundDevice
-from capture.devices.protocol import ClockKind, DeviceInfo, TriggerKind, TriggerSpec
+from capture.devices.protocol import ClockKind, DeviceInfo, TriggerKind, TriggerSpec, WholeDevice
 from capture.devices.slots import SlotPool
 from capture.errors import DeviceError
 from capture.frame import FrameEvent
 from capture.frame_header import ImageLayout
 
 
-class CountingDevice:
+class CountingDevice(WholeDevice):
     """Runs freely, each image filled with its frame number; its own trigger, acquire and frames."""
 
     def __init__(self, address: str, name: str) -> None:
@@ -26,7 +26,6 @@ class CountingDevice:
             layout=ImageLayout(32, 24, 1, "uint8"), triggers=(TriggerKind.FREE_RUN,),
             id_bits=32, first_id=0, clock=ClockKind.HOST,
         )  # fmt: skip
-        self.trigger = self.acquire = self.frames = self
         self._spec: TriggerSpec | None = None
         self._pool: SlotPool | None = None
         self._number, self._due_ns = 0, 0  # of the next frame; it is never due while stopped

@@ -17,6 +17,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO
 
+from capture.disk_faults import Disk, RealDisk
 from capture.errors import WorkError
 
 _KEEP_SIZE = 1  # FALLOC_FL_KEEP_SIZE: room is taken, the file's length stays
@@ -31,12 +32,13 @@ class AppendFile:
         offset: its length: all appended parts are whole up to there.
     """
 
-    def __init__(self, path: Path, label: str = "") -> None:
+    def __init__(self, path: Path, label: str = "", disk: Disk | None = None) -> None:
         """Make the file, or empty the one that is there.
 
         Args:
             path: the file.
             label: what messages call it, where that is not its path.
+            disk: that it is written to; this machine's when not given.
 
         Raises:
             WorkError: when the disk is full or fails.
@@ -44,6 +46,7 @@ class AppendFile:
         self.path = Path(path)
         self._label = label or str(path)
         self.offset = 0
+        self._disk: Disk = disk if disk is not None else RealDisk()
         try:
             self._file: BinaryIO = self.path.open("wb", buffering=0)
         except OSError as error:
@@ -77,7 +80,7 @@ class AppendFile:
         end = self.offset
         while pending:
             try:
-                written = os.writev(self._file.fileno(), pending)
+                written = self._disk.writev(self.path, self._file.fileno(), pending)
             except OSError as error:
                 self._cut_back()
                 raise WorkError(self._said(error)) from error

@@ -18,6 +18,7 @@ from capture.arrays import Image
 from capture.device_watch import DeviceState, DeviceWatch
 from capture.devices.array import DeviceArray
 from capture.devices.capabilities import Health, Reconnecting
+from capture.disk_faults import Disk
 from capture.errors import DeviceError, LikenessError, TakeError
 from capture.lanes import WriteLanes
 from capture.live_take import LiveTake
@@ -40,9 +41,18 @@ class LiveArray:
         trouble: why streaming ended by itself; empty while all is well.
     """
 
-    def __init__(self, array: DeviceArray, settings: RecordSettings) -> None:
-        """Hold an array; nothing runs yet."""
+    def __init__(
+        self, array: DeviceArray, settings: RecordSettings, disk: Disk | None = None
+    ) -> None:
+        """Hold an array; nothing runs yet.
+
+        Args:
+            array: the devices and what triggers them.
+            settings: rate, exposure, pre-roll, memory.
+            disk: that takes are written to; this machine's when not given.
+        """
         self.array, self.settings = array, settings
+        self._disk = disk
         self.trouble = ""
         self._stream = self._fresh_stream()
         self._watch: DeviceWatch | None = None
@@ -139,8 +149,9 @@ class LiveArray:
         def make() -> TakeWriter:
             layouts = {device.info.name: device.info.layout for device in self.array.devices}
             return TakeWriter(
-                partial_folder(folder), layouts, opening=opening, expected_frames=count
-            )
+                partial_folder(folder), layouts, opening=opening, expected_frames=count,
+                disk=self._disk,
+            )  # fmt: skip
 
         thread = threading.Thread(
             target=take.see_through, args=(make, watch, self._checking), daemon=True

@@ -23,6 +23,7 @@ import numpy as np
 from capture import mcap_records as records
 from capture.arrays import Image
 from capture.crc import Crc32Joiner, crc32
+from capture.disk_faults import Disk
 from capture.durable import AppendFile
 from capture.errors import TakeError, WorkError
 from capture.frame_header import HEADER_BYTES, FrameHeader, ImageLayout, raw_pixels
@@ -126,7 +127,13 @@ class FrameWriter:
     """
 
     def __init__(
-        self, path: Path, device: str, layout: ImageLayout, *, reserve_frames: int = 0
+        self,
+        path: Path,
+        device: str,
+        layout: ImageLayout,
+        *,
+        reserve_frames: int = 0,
+        disk: Disk | None = None,
     ) -> None:
         """Open the file and write its head.
 
@@ -135,6 +142,7 @@ class FrameWriter:
             device: the device's name, which becomes the channel's topic.
             layout: size and pixel type of every frame.
             reserve_frames: how many to take room on the disk for at once, if it has it.
+            disk: that it is written to; this machine's when not given.
 
         Raises:
             WorkError: when the disk is full or fails.
@@ -144,7 +152,7 @@ class FrameWriter:
         self._joiner = Crc32Joiner(layout.nbytes)
         self._index: list[tuple[int, int, int]] = []  # log time, offset and length of each chunk
         head, self._schema, self._channel = file_head(device, layout)
-        self._file = AppendFile(partial_file(self.path), str(self.path))
+        self._file = AppendFile(partial_file(self.path), str(self.path), disk)
         try:
             if reserve_frames:
                 stride = frame_bytes(layout) + len(records.message_index(0))

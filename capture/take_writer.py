@@ -16,6 +16,7 @@ from types import TracebackType
 from typing import Any
 
 from capture.arrays import Image
+from capture.disk_faults import Disk
 from capture.durable import AppendFile, FolderLock, KeptSynced, in_memory, sync_tree
 from capture.errors import TakeError, WorkError
 from capture.frame_header import FrameHeader, ImageLayout
@@ -53,6 +54,7 @@ class TakeWriter:
         *,
         opening: Mapping[str, Any] | None = None,
         expected_frames: int | None = None,
+        disk: Disk | None = None,
     ) -> None:
         """Make the folder and open one file a device.
 
@@ -63,6 +65,7 @@ class TakeWriter:
                 `take_number`, `settings`, `train`. It is written to opening.json, the folder stays
                 locked until the `with` block ends, and frames reach the disk within half a second.
             expected_frames: how many frames each device is to give.
+            disk: that frames are written to; this machine's when not given.
 
         Raises:
             WorkError: when the disk is full or fails.
@@ -82,7 +85,9 @@ class TakeWriter:
             room = self._room_for(expected_frames)
             for name, layout in layouts.items():
                 path = frames / f"{name}.mcap"
-                self._writers[name] = FrameWriter(path, name, layout, reserve_frames=room)
+                self._writers[name] = FrameWriter(
+                    path, name, layout, reserve_frames=room, disk=disk
+                )
             if opening is not None:
                 sync_tree(self.folder)
                 self._stack.enter_context(KeptSynced([w.sync for w in self._writers.values()]))

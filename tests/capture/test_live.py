@@ -22,7 +22,8 @@ from capture.devices.simulated import (
     streaming_array,
     streaming_settings,
 )
-from capture.errors import DeviceError, TakeError
+from capture.disk_faults import DiskFault, DiskFaultKind, SimulatedDisk
+from capture.errors import DeviceError, SettingsError, TakeError
 from capture.frame import FrameEvent
 from capture.frame_header import ImageLayout
 from capture.judgement import Colour
@@ -337,3 +338,33 @@ def test_a_disk_that_is_full_ends_no_take_and_what_was_written_stays(small_disk:
     assert sorted(path.name for path in (take.folder / "features").glob("*.json")) == [
         "cam00.json", "cam01.json", "cam02.json",
     ]  # fmt: skip
+
+
+def test_a_disk_that_is_slow_full_or_tears_costs_the_frames_it_hits_and_no_more(
+    tmp_path: Path,
+) -> None:
+    session, disk = Session.create(tmp_path / "s"), SimulatedDisk()
+    with LiveArray(array_of(), SETTINGS, disk) as live:
+        time.sleep(0.15)
+        live_take = live.record(session, Shot(slate="smile", kind="expression", frames=60))
+        until(lambda: live_take.fraction > 0.3)
+        disk.inject(DiskFault(DiskFaultKind.SLOW, seconds=0.3))
+        disk.inject(DiskFault(DiskFaultKind.FULL, "cam01", writes=4))
+        disk.inject(DiskFault(DiskFaultKind.TORN, "cam02"))
+        take = done(live_take)
+    ledger = take.ledger()
+    notes = {
+        name: [e.note for e in ledger.entries if e.device == name and e.verdict == Verdict.LOST]
+        for name in ledger.devices
+    }
+    assert [len(notes[name]) for name in ("cam00", "cam01", "cam02")] == [0, 4, 1]
+    assert all("No space left" in note for note in notes["cam01"])
+    assert "Input/output error" in notes["cam02"][0]
+    assert ledger.counts()[Verdict.OK] == 3 * ledger.triggers - 5
+    assert take.manifest.remarks["judgement"]["colour"] == "red"
+    check_pixels(take)
+
+
+def test_a_disk_fault_of_no_writes_is_refused() -> None:
+    with pytest.raises(SettingsError, match=r"found 0 and 0\.0"):
+        DiskFault(DiskFaultKind.FULL, writes=0)

@@ -17,8 +17,8 @@ from dataclasses import dataclass
 from types import TracebackType
 
 from capture.arrays import Image
-from capture.crc import crc32
 from capture.errors import LikenessError
+from capture.frame_header import pixel_crc
 from capture.window import HeldFrame
 
 Write = Callable[[HeldFrame, Image, int], None]
@@ -96,7 +96,7 @@ class _Lane:
         while (job := self._fresh.get()) is not None:
             with _Attempt(job.fail):
                 pixels = job.frame.device.frames.pixels(job.frame.event)
-                self._ready.put((job, pixels, crc32(pixels.reshape(-1).view("u1"))))
+                self._ready.put((job, pixels, pixel_crc(pixels)))
                 continue
             self._give_back(job)
         self._ready.put(None)

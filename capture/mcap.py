@@ -10,6 +10,7 @@ References:
 
 from __future__ import annotations
 
+import functools
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -27,7 +28,8 @@ from capture.disk_faults import Disk
 from capture.durable import AppendFile
 from capture.errors import TakeError, WorkError
 from capture.frame_header import HEADER_BYTES, FrameHeader, ImageLayout, raw_pixels
-from capture.mcap_records import CHUNK_HEAD, FOOTER, MAGIC, MESSAGE_PREFIX_BYTES, RECORD, Op
+from capture.mcap_records import CHUNK_HEAD, MAGIC, MESSAGE_PREFIX_BYTES, RECORD, Op
+from capture.mcap_summary import find_summary, parse_chunks
 
 _CHUNK_FRONT_BYTES = RECORD.size + CHUNK_HEAD.size
 _FRONT_BYTES = _CHUNK_FRONT_BYTES + MESSAGE_PREFIX_BYTES  # of a chunk, before its pixels
@@ -326,33 +328,17 @@ class FrameReader:
         raise TakeError(f"{self.path}: cut before its first frame: no channel record")
 
     def _read_summary(self, file: BinaryIO) -> list[int] | None:
-        tail = RECORD.size + FOOTER.size + len(MAGIC)
-        if self._size < tail + len(MAGIC):
+        expected = frame_bytes(self.layout)
+        found = find_summary(functools.partial(_read_at, file), self._size, expected)
+        if found is None or not found.ended:
             return None
-        footer = _read_at(file, self._size - tail, tail)
-        opcode_and_size = (Op.FOOTER, FOOTER.size)
-        if footer[-len(MAGIC) :] != MAGIC or RECORD.unpack_from(footer) != opcode_and_size:
-            return None
-        start, _, crc = FOOTER.unpack_from(footer, RECORD.size)
-        if not 0 < start <= self._size - tail:
-            return None
-        longest = records.longest_summary(start, frame_bytes(self.layout))
-        if self._size - tail - start > longest:
-            return None
-        summary = _read_at(file, start, self._size - tail - start)
-        if crc32(summary + footer[: RECORD.size + 16]) != crc:
-            return None
-        chunks = records.parse_chunks(summary)
-        expected = RECORD.size + self._chunk_bytes()
-        if any(size != expected or offset + size > start for offset, size in chunks):
+        chunks = parse_chunks(found.content)
+        if any(size != expected or offset + size > found.start for offset, size in chunks):
             return None
         return [offset for offset, _ in chunks]
 
-    def _chunk_bytes(self) -> int:
-        return CHUNK_HEAD.size + MESSAGE_PREFIX_BYTES + self.layout.nbytes
-
     def _scan(self, file: BinaryIO, offset: int) -> Iterator[int]:
-        expected = self._chunk_bytes()
+        expected = frame_bytes(self.layout) - RECORD.size
         while (found := self._record_at(file, offset)) is not None:
             opcode, length = found
             if opcode == Op.CHUNK:

@@ -23,8 +23,6 @@ FOOTER = struct.Struct("<QQI")  # start of summary, of summary offsets, crc
 MESSAGE_PREFIX_BYTES = RECORD.size + MESSAGE_HEAD.size + HEADER_BYTES  # before the pixels
 LARGEST_CHANNEL = 1 << 20  # bytes of its record: a file can claim any length
 _INDEX_BYTES = RECORD.size + 22  # of the message index that follows each chunk
-_SUMMARY_BYTES = 1 << 16  # of all in a summary that there is once
-_CHUNK_INDEX_BYTES = RECORD.size + 74
 
 
 class Op(IntEnum):
@@ -109,25 +107,6 @@ def summary(
     footer = RECORD.pack(Op.FOOTER, FOOTER.size) + struct.pack("<QQ", start, start + len(body))
     crc = zlib.crc32(body + offsets + footer)
     return body + offsets + footer + struct.pack("<I", crc) + MAGIC
-
-
-def longest_summary(data_bytes: int, chunk_bytes: int) -> int:
-    """No summary is longer, of a file with `data_bytes` before it in chunks of `chunk_bytes`."""
-    return _SUMMARY_BYTES + data_bytes // chunk_bytes * _CHUNK_INDEX_BYTES
-
-
-def parse_chunks(summary_bytes: bytes) -> list[tuple[int, int]]:
-    """Offset and length of each chunk, from a summary whose CRC was checked."""
-    chunks, at = [], 0
-    while at + RECORD.size <= len(summary_bytes):
-        opcode, length = RECORD.unpack_from(summary_bytes, at)
-        if at + RECORD.size + length > len(summary_bytes):
-            break
-        if opcode == Op.CHUNK_INDEX and length >= 32:
-            offset, size = struct.unpack_from("<QQ", summary_bytes, at + RECORD.size + 16)
-            chunks.append((int(offset), int(size)))
-        at += RECORD.size + length
-    return chunks
 
 
 def parse_channel(content: bytes, path: Path) -> dict[str, str]:

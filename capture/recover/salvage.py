@@ -25,7 +25,8 @@ from capture.mcap import (
     header_in,
     log_time_ns,
 )
-from capture.mcap_records import CHUNK_HEAD, FOOTER, MAGIC, MESSAGE_PREFIX_BYTES, RECORD, Op
+from capture.mcap_records import CHUNK_HEAD, MESSAGE_PREFIX_BYTES, RECORD, Op
+from capture.mcap_summary import find_summary
 
 _FRONT_BYTES = RECORD.size + CHUNK_HEAD.size + MESSAGE_PREFIX_BYTES
 _HEADER_AT = _FRONT_BYTES - HEADER_BYTES
@@ -159,19 +160,11 @@ class _Search:
 
     def _end_by_footer(self) -> int:
         """Where the frames end by the summary; the end of the file where none is sound."""
-        tail = RECORD.size + FOOTER.size + len(MAGIC)
-        footer = self._read(max(0, self._size - tail), tail)
-        if len(footer) < tail or RECORD.unpack_from(footer) != (Op.FOOTER, FOOTER.size):
+        found = find_summary(self._read, self._size, self._chunk_bytes)
+        if found is None or not found.content:
             return self._size
-        start, _, crc = FOOTER.unpack_from(footer, RECORD.size)
-        if not 0 < start < self._size - tail:
-            return self._size
-        if self._size - tail - start > records.longest_summary(start, self._chunk_bytes):
-            return self._size
-        summary = self._read(start, self._size - tail - start)
-        sound = crc32(summary + footer[: RECORD.size + FOOTER.size - 4]) == crc
-        self._summary_sound = sound and footer.endswith(MAGIC)
-        return int(start) - len(records.DATA_END) if sound else self._size
+        self._summary_sound = found.ended
+        return found.start - len(records.DATA_END)
 
     def _whole(self, at: int) -> bool:
         """Whether the frame at `at` is whole; then `_chunk` holds it."""
